@@ -1,0 +1,1 @@
+"""Robot descriptions: one YAML and one MJCF each, in ``robots/``."""

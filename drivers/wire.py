@@ -1,0 +1,70 @@
+"""Wires: the last thing before a syscall. A wire moves frames or bytes; it knows no protocol.
+
+A CAN frame is one row of a structured array with the memory layout of Linux's ``struct can_frame`` (linux/can.h),
+so that a whole tick of frames is one array, one ``bytes`` and one datagram.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+EXTENDED = 0x8000_0000  # bit 31 of ``id``: 29-bit identifier (CAN_EFF_FLAG)
+REMOTE = 0x4000_0000  # bit 30: remote request (CAN_RTR_FLAG)
+ERROR = 0x2000_0000  # bit 29: error frame (CAN_ERR_FLAG)
+
+FRAME = np.dtype(
+    [("id", "<u4"), ("length", "u1"), ("pad", "u1", (3,)), ("data", "u1", (8,))]
+)  # 16 bytes, struct can_frame
+
+
+class WireError(Exception):
+    """A wire cannot carry traffic: what, where, got, expected, next step."""
+
+
+class WireFull(WireError):
+    """The transmit queue took only part of the frames (ENOBUFS). The rest was dropped, never queued for later."""
+
+
+class CanWire(Protocol):
+    """A classic CAN bus: whole ticks of frames in, whole ticks out."""
+
+    def send(self, frames: np.ndarray) -> None:
+        """Queue ``frames`` (FRAME, shape (n,)) in order. Never blocks. Raises WireFull or WireError."""
+        ...
+
+    def recv(self) -> np.ndarray:
+        """All frames that arrived since the last call (FRAME, shape (n,), may be empty). Never blocks."""
+        ...
+
+    def fileno(self) -> int:
+        """For ``select``; -1 where there is nothing to wait on (lockstep simulation)."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class SerialWire(Protocol):
+    """A byte stream (UART, RS-485)."""
+
+    def write(self, data: bytes) -> None:
+        """Queue bytes. Never blocks. Raises WireError when the port is gone."""
+        ...
+
+    def read(self) -> bytes:
+        """Everything that arrived since the last call, possibly ``b""``. Never blocks."""
+        ...
+
+    def fileno(self) -> int: ...
+
+    def close(self) -> None: ...
+
+
+def make_frames(ids: np.ndarray, data: np.ndarray, length: int = 8) -> np.ndarray:
+    """Frames from ``ids`` (n,) uint32 and ``data`` (n, 8) uint8."""
+    frames = np.zeros(len(ids), FRAME)
+    frames["id"] = ids
+    frames["length"] = length
+    frames["data"] = data
+    return frames

@@ -1,0 +1,1 @@
+"""Training and export of skills, and the trained skills themselves (``<robot>/*.onnx`` with a card each)."""

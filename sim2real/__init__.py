@@ -1,0 +1,1 @@
+"""The runtime: state -> policy -> safety -> motors. No torch, ever."""

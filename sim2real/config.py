@@ -1,0 +1,320 @@
+"""RobotConfig: one strict YAML per robot. Unknown keys, NaN and wrong lengths are refused with their path.
+
+``load_robot("g1")`` finds ``configs/robots/g1.yaml``; a path to a YAML elsewhere works too. The models here are what a
+person writes; ``RobotConfig`` also offers the arrays that the hot path reads, in the order of ``joints``.
+"""
+
+from __future__ import annotations
+
+import difflib
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from drivers.bus import BusSpec, ImuSpec, MotorSpec
+from sim2real.types import Sim2realError
+
+CONFIG_DIR = Path(__file__).resolve().parents[1] / "configs" / "robots"
+
+Positive = Annotated[float, Field(gt=0)]
+Unsigned = Annotated[float, Field(ge=0)]
+Range = Annotated[tuple[float, float], Field(description="[lower, upper]")]
+
+
+class ConfigError(Sim2realError):
+    """A robot file, or a name of one, that is wrong. The message says where, got, expected and what to do."""
+
+
+class Strict(BaseModel):
+    """Base of every document that people or other programs write."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, ignored_types=(cached_property,))
+
+
+class JointConfig(Strict):
+    """A joint's hard facts and what the robot may ask of it."""
+
+    name: str
+    position: Range  # rad, the mechanical range
+    velocity: Positive  # rad/s
+    torque: Positive  # N m
+    kp_max: Positive  # N m/rad
+    kd_max: Positive  # N m s/rad
+    damping: Positive  # N m s/rad: kd while damping
+    group: Literal["leg", "waist", "arm", "hand", "head"]
+    source: str  # where the numbers come from, with the hardware variant
+
+    @model_validator(mode="after")
+    def _ordered(self) -> JointConfig:
+        if not self.position[0] < self.position[1]:
+            raise ValueError(f"position: got {list(self.position)}, expected [lower, upper] with lower < upper")
+        return self
+
+
+class SafetyConfig(Strict):
+    """Thresholds of the safety gate; every field is used by the rule of the same name in ``sim2real/safety``."""
+
+    position_margin: Unsigned = 0.02  # rad inside the mechanical range
+    velocity_max_ratio: Positive = 1.2  # of each joint's velocity: measured above this is a fault
+    target_velocity_ratio: Positive = 1.0  # slew: targets move at most this share of the joint's velocity
+    torque_ratio: Positive = 1.0  # of each joint's torque: predicted PD torque is kept below this
+    tilt: Positive = 1.0  # rad between the base's up and gravity's
+    angular_velocity: Positive = 12.0  # rad/s of the base
+    temperature_warn: Positive = 80.0  # deg C
+    temperature: Positive = 100.0  # deg C
+    joint_age: Positive = 0.04  # s without feedback from a joint
+    imu_age: Positive = 0.04  # s
+    command_age_hold: Positive = 0.04  # s without a fresh command: hold
+    command_age: Positive = 0.06  # s without a fresh command: damp
+    hold_time: Positive = 0.04  # s: longest hold of any cause, then damp
+    arm_tilt: Positive = 0.35  # rad: refuse to arm beyond
+    arm_velocity: Positive = 0.5  # rad/s: refuse to arm while any joint moves faster
+    tick_gap: Positive = 0.06  # s between two ticks of the gate: beyond it, it was suspended
+
+
+class MotorConfig(Strict):
+    joint: str
+    model: str
+    id: Annotated[int, Field(ge=0)]
+    feedback_id: Annotated[int, Field(ge=0)] = 0
+    sign: Literal[-1, 1] = 1
+    offset: float = 0.0
+
+
+class BusConfig(Strict):
+    name: str
+    protocol: str
+    interface: str = "socketcan"
+    channel: str = ""
+    bitrate: Annotated[int, Field(gt=0)] = 1_000_000
+    watchdog: Positive = 0.08
+    motors: Annotated[list[MotorConfig], Field(min_length=1)]
+
+
+class ImuConfig(Strict):
+    protocol: str
+    interface: str = "serial"
+    channel: str = ""
+    baud: Annotated[int, Field(gt=0)] = 921_600
+    rate: Positive = 500.0
+    site: str = "imu"
+    orientation_imu_in_base: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+
+class Wiring(Strict):
+    """One way this robot is wired: joints to motors on buses, at a rate."""
+
+    description: str
+    rate: Positive  # Hz of the guardian
+    buses: Annotated[list[BusConfig], Field(min_length=1)]
+    imu: ImuConfig
+
+    def bus_specs(self) -> list[BusSpec]:
+        return [
+            BusSpec(b.name, b.protocol, tuple(MotorSpec(**m.model_dump()) for m in b.motors), b.interface, b.channel,
+                    b.bitrate, b.watchdog)
+            for b in self.buses
+        ]  # fmt: skip
+
+    def imu_spec(self) -> ImuSpec:
+        return ImuSpec(**self.imu.model_dump())
+
+
+class PoseConfig(Strict):
+    """A posture with the gains that hold it; joints not named are at zero."""
+
+    joints: dict[str, float] = {}
+    kp: dict[str, Positive] = {}
+    kd: dict[str, Positive] = {}
+
+
+class PolicyEntry(Strict):
+    """One policy file of this robot, relative to the repository."""
+
+    file: str
+    description: str = ""
+
+
+class RobotConfig(Strict):
+    name: str
+    description: str
+    variants: list[int] = []  # hardware variant ids (Unitree: mode_machine) whose limits these are
+    model: str  # MJCF, beside the YAML
+    base: str  # body whose frame is "base"
+    licence: str
+    joints: Annotated[list[JointConfig], Field(min_length=1)]
+    safety: SafetyConfig = SafetyConfig()
+    home: PoseConfig  # where a soft start goes when the policy says nothing else
+    policies: dict[str, PolicyEntry] = {}
+    default_wiring: str
+    wirings: dict[str, Wiring]
+
+    _path: Path = Path()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> RobotConfig:
+        names = [j.name for j in self.joints]
+        if repeated := sorted({n for n in names if names.count(n) > 1}):
+            raise ValueError(f"joints: got {repeated} more than once, expected every name once")
+        if self.default_wiring not in self.wirings:
+            raise ValueError(f"default_wiring: got '{self.default_wiring}', expected one of {sorted(self.wirings)}")
+        for table in ("joints", "kp", "kd"):
+            for name in getattr(self.home, table):
+                if name not in names:
+                    raise ValueError(f"home.{table}: got '{name}', expected a joint{_did_you_mean(name, names)}")
+        for w, wiring in self.wirings.items():
+            wired = [m.joint for b in wiring.buses for m in b.motors]
+            for name in wired:
+                if name not in names:
+                    raise ValueError(f"wirings.{w}: got joint '{name}', expected a joint{_did_you_mean(name, names)}")
+            if missing := [n for n in names if n not in wired]:
+                raise ValueError(f"wirings.{w}: no motor for {missing}, expected one for every joint")
+            if repeated := sorted({n for n in wired if wired.count(n) > 1}):
+                raise ValueError(f"wirings.{w}: got two motors for {repeated}, expected one for every joint")
+            if len({b.name for b in wiring.buses}) < len(wiring.buses):
+                raise ValueError(f"wirings.{w}: two buses share a name, expected every name once")
+            for b in wiring.buses:
+                ids = [m.id for m in b.motors]
+                if repeated := sorted({i for i in ids if ids.count(i) > 1}):
+                    raise ValueError(f"wirings.{w}.{b.name}: got motor id {repeated} twice, expected every id once")
+        return self
+
+    @property
+    def path(self) -> Path:
+        """The YAML this was read from."""
+        return self._path
+
+    @property
+    def model_path(self) -> Path:
+        """The MJCF."""
+        return self._path.parent / self.model
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        return tuple(j.name for j in self.joints)
+
+    @cached_property
+    def position_min(self) -> np.ndarray:
+        return np.array([j.position[0] for j in self.joints])
+
+    @cached_property
+    def position_max(self) -> np.ndarray:
+        return np.array([j.position[1] for j in self.joints])
+
+    @cached_property
+    def velocity_max(self) -> np.ndarray:
+        return np.array([j.velocity for j in self.joints])
+
+    @cached_property
+    def torque_max(self) -> np.ndarray:
+        return np.array([j.torque for j in self.joints])
+
+    @cached_property
+    def kp_max(self) -> np.ndarray:
+        return np.array([j.kp_max for j in self.joints])
+
+    @cached_property
+    def kd_max(self) -> np.ndarray:
+        return np.array([j.kd_max for j in self.joints])
+
+    @cached_property
+    def damping(self) -> np.ndarray:
+        return np.array([j.damping for j in self.joints])
+
+    @cached_property
+    def home_pos(self) -> np.ndarray:
+        return self._home("joints", 0.0)
+
+    @cached_property
+    def home_kp(self) -> np.ndarray:
+        return self._home("kp", 40.0)
+
+    @cached_property
+    def home_kd(self) -> np.ndarray:
+        return self._home("kd", 2.0)
+
+    def _home(self, table: str, default: float) -> np.ndarray:
+        return np.array([getattr(self.home, table).get(n, default) for n in self.joint_names])
+
+    def indices(self, names: list[str] | tuple[str, ...]) -> np.ndarray:
+        """Where ``names`` are among ``joint_names`` (len(names),). Raises ConfigError naming a stranger."""
+        for name in names:
+            if name not in self.joint_names:
+                raise ConfigError(f"{self.name}: no joint '{name}'{_did_you_mean(name, self.joint_names)}")
+        return np.array([self.joint_names.index(n) for n in names], dtype=np.intp)
+
+    def wiring(self, name: str = "") -> Wiring:
+        """The wiring ``name``, or the default one."""
+        name = name or self.default_wiring
+        if name not in self.wirings:
+            raise ConfigError(
+                f"{self.name}: no wiring '{name}'{_did_you_mean(name, self.wirings)}; it has {', '.join(self.wirings)}"
+            )
+        return self.wirings[name]
+
+
+def robot_names() -> list[str]:
+    """Every robot shipped."""
+    return sorted(p.stem for p in CONFIG_DIR.glob("*.yaml"))
+
+
+def load_robot(name: str | Path) -> RobotConfig:
+    """Read a robot by name (``g1``) or by path to its YAML. Raises ConfigError."""
+    path = Path(name) if str(name).endswith((".yaml", ".yml")) else CONFIG_DIR / f"{name}.yaml"
+    if not path.is_file():
+        known = robot_names()
+        raise ConfigError(
+            f"robot '{name}': no file {path}{_did_you_mean(str(name), known)}\n"
+            f"  robots here: {', '.join(known)}; or give the path of a YAML of your own"
+        )
+    try:
+        document = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path}: not YAML: {error}") from None
+    try:
+        robot = RobotConfig.model_validate(document)
+    except ValidationError as error:
+        raise ConfigError(_explain(path, error)) from None
+    robot._path = path
+    return robot
+
+
+def explain(where: str, error: ValidationError, document: Any = None) -> str:
+    """A pydantic error as lines ``where: a.b[3].c: got X, expected ...``."""
+    lines = []
+    for e in error.errors():
+        path = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in e["loc"]).lstrip(".")
+        if e["type"] == "extra_forbidden":
+            key, fields = str(e["loc"][-1]), _fields_at(e["loc"][:-1])
+            lines.append(f"{path}: unknown key{_did_you_mean(key, fields)}; expected one of {', '.join(fields)}")
+        elif e["type"] == "value_error":
+            lines.append(f"{path}: {e['ctx']['error']}" if path else str(e["ctx"]["error"]))
+        elif e["type"] == "missing":
+            lines.append(f"{path}: missing; add it")
+        else:
+            message = e["msg"].replace("Input should be", "expected").replace("Field required", "expected a value")
+            lines.append(f"{path}: got {e['input']!r}, {message}")
+    return "\n".join(f"{where}: {line}" for line in lines)
+
+
+def _explain(path: Path, error: ValidationError) -> str:
+    return explain(str(path), error)
+
+
+def _fields_at(loc: tuple) -> list[str]:
+    """Names of the fields of the model at a location of a RobotConfig document."""
+    model: Any = RobotConfig
+    steps = {"joints": JointConfig, "safety": SafetyConfig, "home": PoseConfig, "policies": PolicyEntry,
+             "wirings": Wiring, "buses": BusConfig, "motors": MotorConfig, "imu": ImuConfig}  # fmt: skip
+    for part in loc:
+        model = steps.get(part, model)
+    return list(model.model_fields)
+
+
+def _did_you_mean(word: str, options: Any) -> str:
+    close = difflib.get_close_matches(word, list(options), n=1)
+    return f" (did you mean '{close[0]}'?)" if close else ""

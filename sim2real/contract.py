@@ -1,0 +1,178 @@
+"""The policy contract: what a policy file says about itself, as one JSON document under the ONNX key ``sim2real``.
+
+A policy's inputs are named physical signals in SI units and its outputs are joint targets; everything in between
+(observation, normalisation, history, scaling) is inside the graph. ``SIGNALS`` is the complete vocabulary: what a signal
+is called, its shape, unit and frame, and its LEAPP ``kind``, so that export to LEAPP is a renaming.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, NamedTuple
+
+from pydantic import Field, model_validator
+
+from sim2real.config import Positive, Strict, Unsigned
+
+METADATA_KEY = "sim2real"
+SCHEMA = 1
+
+
+class Signal(NamedTuple):
+    """One word of the vocabulary. ``size``: a number, or what it counts (``joints``, ``targets``, ``skills``)."""
+
+    size: int | str
+    unit: str
+    kind: str
+    meaning: str
+
+
+INPUTS: dict[str, Signal] = {
+    "joint_pos": Signal("joints", "rad", "state/joint/position", "in the policy's own joint_names order"),
+    "joint_vel": Signal("joints", "rad/s", "state/joint/velocity", "in the policy's own joint_names order"),
+    "orientation_base_in_world": Signal(4, "1", "state/body/rotation", "quaternion w, x, y, z; yaw is arbitrary"),
+    "angular_velocity_base_in_base": Signal(3, "rad/s", "state/body/angular_velocity", "gyroscope"),
+    "command_velocity": Signal(3, "m/s, m/s, rad/s", "command/body/velocity", "forward, left, turn, in the base"),
+    "skill": Signal("skills", "1", "command/skill", "one-hot over skill_labels"),
+    "object_position_in_base": Signal(3, "m", "state/body/position", "centre of the object"),
+    "object_velocity_in_base": Signal(3, "m/s", "state/body/linear_velocity", "of the object's centre"),
+    "linear_velocity_base_in_base": Signal(3, "m/s", "state/body/linear_velocity", "needs an estimator on hardware"),
+}
+OUTPUTS: dict[str, Signal] = {
+    "joint_pos_target": Signal("targets", "rad", "target/joint/position", "absolute, in target_joint_names order"),
+    "observation": Signal("any", "-", "inspect/observation", "what the network saw"),
+    "action": Signal("any", "-", "inspect/action", "what the network said"),
+    "skill_value": Signal("skills", "1", "inspect/value", "per label, how well the policy expects to do from here"),
+}
+CARRY = "carry_"  # carry_x is fed back from carry_x_next
+
+
+class Envelope(Strict):
+    """What training saw of one input, per element."""
+
+    min: list[float]
+    max: list[float]
+    mean: list[float]
+    std: list[float]
+
+
+class Carry(Strict):
+    """A state tensor: its shape without the batch axis, and the values it starts from (flat; empty: zeros)."""
+
+    shape: list[int]
+    start: list[float] = []
+
+
+class Golden(Strict):
+    """A recorded sequence: ``steps`` consecutive calls from the start state. Each array is (steps, size), row by row."""
+
+    steps: Annotated[int, Field(gt=0)]
+    inputs: dict[str, list[list[float]]]
+    outputs: dict[str, list[list[float]]]
+
+
+class Hold(Strict):
+    """What a joint that the policy does not drive does meanwhile."""
+
+    position: float
+    kp: Unsigned
+    kd: Unsigned
+
+
+class Skill(Strict):
+    """One label a policy can perform."""
+
+    label: str
+    description: str = ""
+    next: list[str] | None = None  # labels it may be followed by; None: any
+    dwell: Unsigned = 0.3  # s, shortest stay
+    value_min: float | None = None  # refuse to switch to it while skill_value is below
+
+
+class Provenance(Strict):
+    """Where the policy comes from."""
+
+    source: str
+    revision: str = ""
+    licence: str
+    created: str = ""  # date
+    tools: dict[str, str] = {}
+    training: dict[str, str | float | int | bool] = {}
+
+
+class Contract(Strict):
+    """All that a policy says about itself. Lists per joint are in ``joint_names`` / ``target_joint_names`` order."""
+
+    schema_version: Literal[1] = SCHEMA
+    name: str
+    robot: str
+    variants: list[int] = []
+    period: Positive  # s
+    joint_names: Annotated[list[str], Field(min_length=1)]  # joints it observes
+    target_joint_names: Annotated[list[str], Field(min_length=1)]  # joints it drives
+    default_joint_pos: list[float]  # rad, of joint_names: where it expects to start
+    kp: list[Unsigned]  # N m/rad, of target_joint_names, full precision
+    kd: list[Unsigned]  # N m s/rad
+    hold: dict[str, Hold] = {}  # joints of the robot that it does not drive
+    action_scale: list[float] = []  # for other stacks: already applied inside joint_pos_target
+    inputs: dict[str, list[int]]  # name -> shape without the batch axis
+    outputs: dict[str, list[int]]
+    carry: dict[str, Carry] = {}
+    skills: Annotated[list[Skill], Field(min_length=1)]
+    default_skill: str
+    command_velocity_min: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    command_velocity_max: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quaternion_order: Literal["wxyz"] = "wxyz"
+    history: str = "inside the graph"
+    envelope: dict[str, Envelope] = {}
+    golden: Annotated[list[Golden], Field(min_length=1)]
+    golden_tolerance: Positive = 1e-4
+    provenance: Provenance
+
+    @property
+    def skill_labels(self) -> tuple[str, ...]:
+        return tuple(s.label for s in self.skills)
+
+    def skill(self, label: str) -> Skill:
+        return self.skills[self.skill_labels.index(label)]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Contract:
+        sizes = {
+            "default_joint_pos": self.joint_names,
+            "kp": self.target_joint_names,
+            "kd": self.target_joint_names,
+            **({"action_scale": self.target_joint_names} if self.action_scale else {}),
+        }
+        for key, names in sizes.items():
+            if len(getattr(self, key)) != len(names):
+                raise ValueError(f"{key}: got {len(getattr(self, key))} numbers, expected {len(names)}, one per joint")
+        for key in ("joint_names", "target_joint_names", "skill_labels"):
+            if len(set(getattr(self, key))) < len(getattr(self, key)):
+                raise ValueError(f"{key}: a name appears twice, expected every name once")
+        if self.default_skill not in self.skill_labels:
+            raise ValueError(f"default_skill: got '{self.default_skill}', expected one of {list(self.skill_labels)}")
+        for skill in self.skills:
+            for label in skill.next or ():
+                if label not in self.skill_labels:
+                    raise ValueError(f"skills: '{skill.label}' leads to '{label}', expected one of {self.skill_labels}")
+        counts = {"joints": len(self.joint_names), "targets": len(self.target_joint_names), "skills": len(self.skills)}
+        for side, vocabulary in (("inputs", INPUTS), ("outputs", OUTPUTS)):
+            for name, shape in getattr(self, side).items():
+                if name.startswith(CARRY):
+                    continue
+                if name not in vocabulary:
+                    raise ValueError(f"{side}: got '{name}', expected one of {sorted(vocabulary)} or carry_*")
+                size = vocabulary[name].size
+                expected = counts.get(size, None) if isinstance(size, str) else size
+                if expected is not None and shape != [expected]:
+                    raise ValueError(f"{side}: '{name}' has shape {shape}, expected [{expected}]")
+        if "joint_pos_target" not in self.outputs:
+            raise ValueError("outputs: no 'joint_pos_target', expected it: a policy's outputs are joint targets")
+        for name, carry in self.carry.items():
+            if name not in self.inputs or f"{name}_next" not in self.outputs:
+                raise ValueError(f"carry: '{name}' needs the input '{name}' and the output '{name}_next'")
+            if self.inputs[name] != carry.shape or self.outputs[f"{name}_next"] != carry.shape:
+                raise ValueError(f"carry: '{name}' has shape {self.inputs[name]} in the graph, {carry.shape} declared")
+        if strangers := [n for n in self.inputs if n.startswith(CARRY) and n not in self.carry]:
+            raise ValueError(f"carry: nothing says how {strangers} start")
+        return self
