@@ -1,0 +1,139 @@
+"""The two records of a run. One layout serves the shared-memory channels, the log and the replay.
+
+Every element is eight bytes wide, so that numpy's packed layout and CDR's aligned one are the same bytes: a record goes
+into an MCAP file without being touched, and any ROS 2-aware viewer reads it by joint name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sim2real.types import JointCommand, RobotState
+
+QUATERNION = ("w", "x", "y", "z")
+VECTOR = ("x", "y", "z")
+
+
+class Layout(NamedTuple):
+    """A record: its name, its dtype (dots in field names are nesting), and the names of each array field's elements."""
+
+    name: str
+    dtype: np.dtype
+    elements: dict[str, tuple[str, ...]]
+
+    def new(self) -> np.ndarray:
+        """One zeroed record, shape (1,): its fields are views, so filling them in place fills the record."""
+        return np.zeros(1, self.dtype)
+
+
+def layout(name: str, fields: Sequence[tuple[str, str, Sequence[str] | None]]) -> Layout:
+    """A Layout from (field, "f8" | "i8", names of its elements or None for a scalar)."""
+    dtype = np.dtype([(f, t) if names is None else (f, t, (len(names),)) for f, t, names in fields])
+    assert all(np.dtype(t).itemsize == 8 for _, t, _ in fields)
+    return Layout(name, dtype, {f: tuple(names) for f, _, names in fields if names is not None})
+
+
+def state_fields(joints: Sequence[str]) -> list[tuple[str, str, Sequence[str] | None]]:
+    return [
+        ("state.time", "f8", None),
+        ("state.joint_pos", "f8", joints),
+        ("state.joint_vel", "f8", joints),
+        ("state.joint_torque", "f8", joints),
+        ("state.joint_temperature", "f8", joints),
+        ("state.joint_error", "i8", joints),
+        ("state.joint_enabled", "i8", joints),
+        ("state.joint_age", "f8", joints),
+        ("state.orientation_base_in_world", "f8", QUATERNION),
+        ("state.angular_velocity_base_in_base", "f8", VECTOR),
+        ("state.acceleration_base_in_base", "f8", VECTOR),
+        ("state.imu_age", "f8", None),
+    ]
+
+
+def command_fields(prefix: str, joints: Sequence[str]) -> list[tuple[str, str, Sequence[str] | None]]:
+    return [(f"{prefix}.time", "f8", None)] + [
+        (f"{prefix}.{f}", "f8", joints) for f in ("joint_pos", "joint_vel", "joint_torque", "kp", "kd")
+    ]
+
+
+def tick_layout(joints: Sequence[str], buses: Sequence[str]) -> Layout:
+    """What the guardian saw, was asked for, and sent, each tick."""
+    return layout(
+        "Tick",
+        [
+            ("time", "f8", None),  # s, scheduled time of the tick
+            ("tick", "i8", None),
+            ("late", "i8", None),  # ticks skipped so far because one was late
+            ("mode", "i8", None),  # types.Mode after the gate
+            ("fault", "i8", None),  # number of the latched rule (S2R-014 -> 14), 0: none
+            ("fault_joint", "i8", None),  # joint index of the fault, -1: none
+            ("limited", "i8", None),  # how many joint targets the gate changed this tick
+            *state_fields(joints),
+            *command_fields("request", joints),  # the newest command from the pilot; time 0: none yet
+            *command_fields("command", joints),  # what went to the motors; all zero while OFF
+            ("timing.lateness", "f8", None),  # s between the scheduled and the real start of this tick
+            ("timing.read", "f8", None),  # s spent in each stage
+            ("timing.safety", "f8", None),
+            ("timing.write", "f8", None),
+            ("bus.load", "f8", buses),  # share of the wire's time used since the last tick
+            ("bus.sent", "i8", buses),
+            ("bus.received", "i8", buses),
+            ("bus.rejected", "i8", buses),
+            ("bus.lost", "i8", buses),
+        ],
+    )
+
+
+def pilot_layout(joints: Sequence[str], inputs: dict[str, Sequence[str]], skills: Sequence[str]) -> Layout:
+    """What the pilot fed its policy and what came out, each policy tick. ``inputs``: signal -> element names."""
+    return layout(
+        "Pilot",
+        [
+            ("time", "f8", None),
+            ("tick", "i8", None),
+            ("late", "i8", None),
+            ("stage", "i8", None),  # skills.Stage
+            ("policy", "i8", None),  # index of the policy in the run's list
+            ("skill", "i8", None),  # index of the current label, over all labels of the run
+            ("refused", "i8", None),  # skill switches refused so far
+            ("operator.skill", "i8", None),  # wanted label, -1: none
+            ("operator.velocity", "f8", VECTOR),
+            ("operator.age", "f8", None),
+            *[(f"input.{name}", "f8", elements) for name, elements in inputs.items()],
+            *command_fields("command", joints),
+            ("skill_value", "f8", skills),
+            ("timing.lateness", "f8", None),
+            ("timing.policy", "f8", None),
+            ("timing.total", "f8", None),
+        ],
+    )
+
+
+def state_view(record: np.ndarray) -> RobotState:
+    """A RobotState whose arrays are views into ``record``; scalars are copies (write them with ``store_scalars``)."""
+    r = record[0]
+    return RobotState(
+        time=float(r["state.time"]),
+        joint_pos=record["state.joint_pos"][0],
+        joint_vel=record["state.joint_vel"][0],
+        joint_torque=record["state.joint_torque"][0],
+        joint_temperature=record["state.joint_temperature"][0],
+        joint_error=record["state.joint_error"][0],
+        joint_enabled=record["state.joint_enabled"][0],
+        joint_age=record["state.joint_age"][0],
+        orientation_base_in_world=record["state.orientation_base_in_world"][0],
+        angular_velocity_base_in_base=record["state.angular_velocity_base_in_base"][0],
+        acceleration_base_in_base=record["state.acceleration_base_in_base"][0],
+        imu_age=float(r["state.imu_age"]),
+    )
+
+
+def command_view(record: np.ndarray, prefix: str) -> JointCommand:
+    """A JointCommand whose arrays are views into ``record`` (fields ``<prefix>.*``)."""
+    return JointCommand(
+        time=float(record[f"{prefix}.time"][0]),
+        **{f: record[f"{prefix}.{f}"][0] for f in ("joint_pos", "joint_vel", "joint_torque", "kp", "kd")},
+    )
