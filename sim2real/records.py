@@ -7,6 +7,7 @@ into an MCAP file without being touched, and any ROS 2-aware viewer reads it by 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import IntFlag
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,14 @@ from sim2real.types import JointCommand, RobotState
 
 QUATERNION = ("w", "x", "y", "z")
 VECTOR = ("x", "y", "z")
+
+
+class Calls(IntFlag):
+    """What was asked of the gate in a tick, besides ``step``: the edges a replay has to repeat."""
+
+    ARM = 1
+    STOP = 2
+    OFF = 4
 
 
 class Layout(NamedTuple):
@@ -67,6 +76,8 @@ def tick_layout(joints: Sequence[str], buses: Sequence[str]) -> Layout:
             ("time", "f8", None),  # s, scheduled time of the tick
             ("tick", "i8", None),
             ("late", "i8", None),  # ticks skipped so far because one was late
+            ("now", "f8", None),  # s, clock time given to the gate; with ``calls`` it makes a replay exact
+            ("calls", "i8", None),  # Calls made on the gate before this tick's step, in the order of their bits
             ("mode", "i8", None),  # types.Mode after the gate
             ("fault", "i8", None),  # number of the latched rule (S2R-014 -> 14), 0: none
             ("fault_joint", "i8", None),  # joint index of the fault, -1: none
