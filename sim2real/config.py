@@ -7,9 +7,10 @@ person writes; ``RobotConfig`` also offers the arrays that the hot path reads, i
 from __future__ import annotations
 
 import difflib
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import yaml
@@ -165,12 +166,12 @@ class RobotConfig(Strict):
         for table in ("joints", "kp", "kd"):
             for name in getattr(self.home, table):
                 if name not in names:
-                    raise ValueError(f"home.{table}: got '{name}', expected a joint{_did_you_mean(name, names)}")
+                    raise ValueError(f"home.{table}: got '{name}', expected a joint{did_you_mean(name, names)}")
         for w, wiring in self.wirings.items():
             wired = [m.joint for b in wiring.buses for m in b.motors]
             for name in wired:
                 if name not in names:
-                    raise ValueError(f"wirings.{w}: got joint '{name}', expected a joint{_did_you_mean(name, names)}")
+                    raise ValueError(f"wirings.{w}: got joint '{name}', expected a joint{did_you_mean(name, names)}")
             if missing := [n for n in names if n not in wired]:
                 raise ValueError(f"wirings.{w}: no motor for {missing}, expected one for every joint")
             if repeated := sorted({n for n in wired if wired.count(n) > 1}):
@@ -244,7 +245,7 @@ class RobotConfig(Strict):
         """Where ``names`` are among ``joint_names`` (len(names),). Raises ConfigError naming a stranger."""
         for name in names:
             if name not in self.joint_names:
-                raise ConfigError(f"{self.name}: no joint '{name}'{_did_you_mean(name, self.joint_names)}")
+                raise ConfigError(f"{self.name}: no joint '{name}'{did_you_mean(name, self.joint_names)}")
         return np.array([self.joint_names.index(n) for n in names], dtype=np.intp)
 
     def wiring(self, name: str = "") -> Wiring:
@@ -252,7 +253,7 @@ class RobotConfig(Strict):
         name = name or self.default_wiring
         if name not in self.wirings:
             raise ConfigError(
-                f"{self.name}: no wiring '{name}'{_did_you_mean(name, self.wirings)}; it has {', '.join(self.wirings)}"
+                f"{self.name}: no wiring '{name}'{did_you_mean(name, self.wirings)}; it has {', '.join(self.wirings)}"
             )
         return self.wirings[name]
 
@@ -268,7 +269,7 @@ def load_robot(name: str | Path) -> RobotConfig:
     if not path.is_file():
         known = robot_names()
         raise ConfigError(
-            f"robot '{name}': no file {path}{_did_you_mean(str(name), known)}\n"
+            f"robot '{name}': no file {path}{did_you_mean(str(name), known)}\n"
             f"  robots here: {', '.join(known)}; or give the path of a YAML of your own"
         )
     try:
@@ -278,19 +279,19 @@ def load_robot(name: str | Path) -> RobotConfig:
     try:
         robot = RobotConfig.model_validate(document)
     except ValidationError as error:
-        raise ConfigError(_explain(path, error)) from None
+        raise ConfigError(explain(str(path), error, RobotConfig)) from None
     robot._path = path
     return robot
 
 
-def explain(where: str, error: ValidationError, document: Any = None) -> str:
-    """A pydantic error as lines ``where: a.b[3].c: got X, expected ...``."""
+def explain(where: str, error: ValidationError, model: type[BaseModel]) -> str:
+    """A pydantic error of a document of ``model`` as lines ``where: a.b[3].c: got X, expected ...``."""
     lines = []
     for e in error.errors():
         path = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in e["loc"]).lstrip(".")
         if e["type"] == "extra_forbidden":
-            key, fields = str(e["loc"][-1]), _fields_at(e["loc"][:-1])
-            lines.append(f"{path}: unknown key{_did_you_mean(key, fields)}; expected one of {', '.join(fields)}")
+            key, fields = str(e["loc"][-1]), _fields_at(model, e["loc"][:-1])
+            lines.append(f"{path}: unknown key{did_you_mean(key, fields)}; expected one of {', '.join(fields)}")
         elif e["type"] == "value_error":
             lines.append(f"{path}: {e['ctx']['error']}" if path else str(e["ctx"]["error"]))
         elif e["type"] == "missing":
@@ -301,20 +302,23 @@ def explain(where: str, error: ValidationError, document: Any = None) -> str:
     return "\n".join(f"{where}: {line}" for line in lines)
 
 
-def _explain(path: Path, error: ValidationError) -> str:
-    return explain(str(path), error)
-
-
-def _fields_at(loc: tuple) -> list[str]:
-    """Names of the fields of the model at a location of a RobotConfig document."""
-    model: Any = RobotConfig
-    steps = {"joints": JointConfig, "safety": SafetyConfig, "home": PoseConfig, "policies": PolicyEntry,
-             "wirings": Wiring, "buses": BusConfig, "motors": MotorConfig, "imu": ImuConfig}  # fmt: skip
+def _fields_at(model: type[BaseModel], loc: tuple) -> list[str]:
+    """Names of the fields of whatever model stands at ``loc`` in a document of ``model``."""
     for part in loc:
-        model = steps.get(part, model)
+        if isinstance(part, str) and part in model.model_fields:
+            model = next(_models_in(model.model_fields[part].annotation), model)
     return list(model.model_fields)
 
 
-def _did_you_mean(word: str, options: Any) -> str:
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models inside an annotation: ``dict[str, list[Bus]]`` -> Bus."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models_in(inner)
+
+
+def did_you_mean(word: str, options: Iterable[str]) -> str:
+    """`` (did you mean 'left_knee_joint'?)``, or nothing where no option is close."""
     close = difflib.get_close_matches(word, list(options), n=1)
     return f" (did you mean '{close[0]}'?)" if close else ""
