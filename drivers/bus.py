@@ -168,6 +168,8 @@ class ImuState:
 
 
 class Imu(Protocol):
+    """An inertial measurement unit on its wire. ``read`` never blocks."""
+
     spec: ImuSpec
     counters: BusCounters
 

@@ -78,6 +78,8 @@ class SafetyConfig(Strict):
 
 
 class MotorConfig(Strict):
+    """The motor of one joint; see ``drivers.bus.MotorSpec``."""
+
     joint: str
     model: str
     id: Annotated[int, Field(ge=0)]
@@ -87,6 +89,8 @@ class MotorConfig(Strict):
 
 
 class BusConfig(Strict):
+    """A bus and its motors; see ``drivers.bus.BusSpec``."""
+
     name: str
     protocol: str
     interface: str = "socketcan"
@@ -97,6 +101,8 @@ class BusConfig(Strict):
 
 
 class ImuConfig(Strict):
+    """An IMU and how it is mounted; see ``drivers.bus.ImuSpec``."""
+
     protocol: str
     interface: str = "serial"
     channel: str = ""
@@ -141,6 +147,8 @@ class PolicyEntry(Strict):
 
 
 class RobotConfig(Strict):
+    """A whole robot: what a person writes, and the same as arrays (n,) in the order of ``joints``."""
+
     name: str
     description: str
     variants: list[int] = []  # hardware variant ids (Unitree: mode_machine) whose limits these are

@@ -46,6 +46,7 @@ def layout(name: str, fields: Sequence[tuple[str, str, Sequence[str] | None]]) -
 
 
 def state_fields(joints: Sequence[str]) -> list[tuple[str, str, Sequence[str] | None]]:
+    """The fields of a ``types.RobotState``."""
     return [
         ("state.time", "f8", None),
         ("state.joint_pos", "f8", joints),
@@ -63,6 +64,7 @@ def state_fields(joints: Sequence[str]) -> list[tuple[str, str, Sequence[str] | 
 
 
 def command_fields(prefix: str, joints: Sequence[str]) -> list[tuple[str, str, Sequence[str] | None]]:
+    """The fields of a ``types.JointCommand``, under ``prefix``."""
     return [(f"{prefix}.time", "f8", None)] + [
         (f"{prefix}.{f}", "f8", joints) for f in ("joint_pos", "joint_vel", "joint_torque", "kp", "kd")
     ]
