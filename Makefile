@@ -23,7 +23,7 @@ test: check ## Everything: check, the whole test suite, the safety gate
 check: $(VENV)/.all ## Format, lint and types
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 format: $(VENV)/.all ## Format, and fix what can be fixed
 	$(BIN)/ruff format .

@@ -78,12 +78,14 @@ def refuse(message: str) -> int:
 
 
 def table_of_contents() -> str:
+    """What ``sim2real --help`` prints."""
     width = max(map(len, commands()), default=0)
     rows = [f"  {name:{width}}  {line}" for name, line in commands().items()]
     return "\n".join([USAGE, "", PURPOSE, "", *rows])
 
 
 def version() -> str:
+    """The installed version."""
     from importlib import metadata
 
     try:
