@@ -1,0 +1,214 @@
+"""The guardian: owns the buses; each tick reads, lets the safety gate decide, writes, publishes.
+
+It is small on purpose. It knows no policy, no skill and no file; a hung or dead pilot is to it only a command that grows
+old. The one call that moves the robot is in ``Guardian._transmit``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from drivers.budget import typical_frame_bits
+
+from sim2real.channel import Channel
+from sim2real.clock import MonotonicClock, SimClock
+from sim2real.records import Calls, Layout, command_fields, command_view, layout, state_view, tick_layout
+from sim2real.robot import Robot
+from sim2real.safety import Safety
+from sim2real.types import JointCommand, Mode
+
+TICK, PILOT = 0, 1  # topics of a record
+
+
+class Sink(Protocol):
+    """Where records go; never blocks."""
+
+    def write(self, topic: int, time: float, record: np.ndarray) -> bool: ...
+
+
+def request_layout(joints: tuple[str, ...]) -> Layout:
+    """What a pilot sends to the guardian."""
+    return layout("Request", command_fields("command", joints))
+
+
+def operator_layout() -> Layout:
+    """What an operator sends to the pilot and the guardian. ``skill``: index over the run's labels, -1: none."""
+    return layout(
+        "Operator",
+        [
+            ("time", "f8", None),
+            ("skill", "i8", None),
+            ("velocity", "f8", ("forward", "left", "turn")),
+            ("arm", "i8", None),
+            ("stop", "i8", None),
+            ("quit", "i8", None),
+        ],
+    )
+
+
+class Guardian:
+    """Call ``tick`` at the bus rate until ``done``.
+
+    Arming takes a few ticks: motors are enabled torque-free, and only when every one of them says so is the gate asked.
+    ``tell`` receives a sentence for the operator whenever something was refused or went wrong.
+    """
+
+    enable_time = 0.3  # s for every motor to answer that it is enabled
+    damp_time = 1.5  # s of damping at the end of a run before the motors are switched off
+
+    def __init__(
+        self,
+        robot: Robot,
+        safety: Safety,
+        clock: MonotonicClock | SimClock,
+        period: float,
+        requests: Channel,
+        operator: Channel,
+        states: Channel,
+        sink: Sink | None = None,
+        tell: Callable[[str], None] = lambda text: None,
+    ):
+        self.robot, self.safety, self.clock, self.period = robot, safety, clock, period
+        self.requests, self.operator, self.states, self.sink, self.tell = requests, operator, states, sink, tell
+        self.done = False
+        self.record = states.layout.new()
+        self._state = state_view(self.record)
+        self._sent = command_view(self.record, "command")
+        self._requested = command_view(self.record, "request")
+        self._wish = command_view(requests.record, "command")
+        self._enabling: float | None = None  # since when
+        self._arm_seen = False
+        self._ending: float | None = None
+        self._told_fault: object = None
+        self._bits = np.array([typical_frame_bits(bus.spec.protocol) / bus.spec.bitrate for bus in robot.buses])
+        self._frames = np.zeros(len(robot.buses))
+        self._tick = 0
+
+    def tick(self, scheduled: float, lateness: float = 0.0, late: int = 0) -> None:
+        """One turn of the loop. Never raises for anything that a bus, a policy or an operator does."""
+        clock, state = self.clock, self._state
+        start = clock.now()
+        self.robot.read(start, state)
+        read = clock.now()
+        calls = self._obey_operator(start)
+        command = self.safety.step(state, self._request(), start)
+        judged = clock.now()
+        self._transmit(command)
+        self._report_fault()
+        self._publish(command, scheduled, lateness, late, calls, (start, read, judged, clock.now()))
+        self._tick += 1
+
+    def quit(self) -> None:
+        """Damp, then switch off and be ``done``. Safe to call again and again."""
+        if self._ending is None:
+            self._ending = self.clock.now()
+
+    def _request(self) -> JointCommand | None:
+        if self.requests.read():
+            self._wish.time = float(self.requests.record["command.time"][0])
+        return self._wish if self._wish.time else None
+
+    def _obey_operator(self, now: float) -> Calls:
+        calls = Calls(0)
+        self.operator.read()
+        wish = self.operator.record[0]
+        if wish["quit"]:
+            self.quit()
+        if wish["stop"] or self._ending is not None:
+            self._enabling = None
+            self.safety.stop(now)
+            calls |= Calls.STOP
+        arm = bool(wish["arm"]) and self._ending is None and not wish["stop"]
+        if arm and not self._arm_seen and self.safety.mode != Mode.RUN:
+            self._enabling = now
+        self._arm_seen = arm
+        if self._enabling is not None and self._arm(now):
+            calls |= Calls.ARM
+        if self._ending is not None and now - self._ending > self.damp_time:
+            self.safety.off()
+            self.done = True
+            calls |= Calls.OFF
+        return calls
+
+    def _arm(self, now: float) -> bool:
+        """Carry an arming on. Returns whether the gate was asked in this tick."""
+        state = self._state
+        assert self._enabling is not None
+        if not state.joint_enabled.all():
+            if now - self._enabling > self.enable_time:
+                silent = [self.robot.config.joint_names[i] for i in np.flatnonzero(state.joint_enabled == 0)]
+                self.tell(f"not armed: no enabled motor answers for {', '.join(silent)}; check power, wiring and ids")
+                self._enabling = None
+                self.robot.disable()
+            else:
+                self._guard(self.robot.enable)
+            return False
+        self._enabling = None
+        if refusal := self.safety.arm(state, now):
+            self.tell(f"not armed: {refusal}")
+            if self.safety.mode == Mode.OFF:
+                self.robot.disable()
+        return True
+
+    def _transmit(self, command: JointCommand) -> None:
+        if self.safety.mode != Mode.OFF or self._enabling is not None:
+            self._guard(lambda: self.robot.write(command))
+        elif self.record["mode"][0] != Mode.OFF or self._tick == 0:
+            self.robot.disable()
+        else:
+            self._guard(self.robot.poll)
+
+    def _guard(self, act: Callable[[], None]) -> None:
+        """Do something on the wire. A bus that fails is damped with the rest: its motors' ages tell the gate."""
+        try:
+            act()
+        except Exception as error:  # noqa: BLE001 - the loop must not unwind while motors hold torque
+            self.tell(str(error))
+            self.safety.stop(self._state.time)
+
+    def _report_fault(self) -> None:
+        fault = self.safety.fault
+        if fault is not None and fault is not self._told_fault:
+            self.tell(self.safety.explain(fault, self.robot.config.joint_names))
+        self._told_fault = fault
+
+    def _publish(self, command, scheduled, lateness, late, calls, times) -> None:
+        r, fault = self.record, self.safety.fault
+        start, read, judged, written = times
+        r["time"], r["tick"], r["late"] = scheduled, self._tick, late
+        r["now"], r["calls"] = start, int(calls)
+        r["mode"], r["limited"] = self.safety.mode, self.safety.limited
+        r["fault"] = fault.rule.number if fault else 0
+        r["fault_joint"] = fault.joint if fault else -1
+        r["state.time"], r["state.imu_age"] = self._state.time, self._state.imu_age
+        _copy(self._wish, self._requested)
+        r["request.time"] = self._wish.time
+        _copy(command, self._sent)
+        r["command.time"] = command.time
+        r["timing.lateness"], r["timing.read"] = lateness, read - start
+        r["timing.safety"], r["timing.write"] = judged - read, written - judged
+        for i, bus in enumerate(self.robot.buses):
+            counters = bus.counters
+            r["bus.sent"][0, i], r["bus.received"][0, i] = counters.sent, counters.received
+            r["bus.rejected"][0, i], r["bus.lost"][0, i] = counters.rejected, counters.lost
+        frames = (r["bus.sent"] + r["bus.received"])[0]
+        r["bus.load"][0] = (frames - self._frames) * self._bits / self.period
+        self._frames = frames
+        self.states.write(r)
+        if self.sink is not None:
+            self.sink.write(TICK, scheduled, r)
+
+
+def guardian_layout(robot_joints: tuple[str, ...], buses: list[str]) -> Layout:
+    """The layout of the guardian's state channel and log topic."""
+    return tick_layout(robot_joints, buses)
+
+
+def _copy(source: JointCommand, target: JointCommand) -> None:
+    target.joint_pos[:] = source.joint_pos
+    target.joint_vel[:] = source.joint_vel
+    target.joint_torque[:] = source.joint_torque
+    target.kp[:] = source.kp
+    target.kd[:] = source.kd

@@ -1,0 +1,52 @@
+"""A scripted operator: a timeline of skills, armed from the start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sim2real.types import OperatorInput, Sim2realError
+
+
+@dataclass(frozen=True)
+class Step:
+    """Perform ``skill`` for ``duration`` s at ``velocity``."""
+
+    skill: str | None
+    duration: float
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class ScriptOperator:
+    """Arms, performs ``steps`` one after another, then quits."""
+
+    def __init__(self, steps: Sequence[Step]):
+        self.steps = list(steps)
+        self.duration = sum(s.duration for s in steps)
+
+    def read(self, now: float, since: float) -> OperatorInput:
+        left = max(0.0, since)
+        for step in self.steps:
+            if left < step.duration:
+                return OperatorInput(now, step.skill, step.velocity, arm=True)
+            left -= step.duration
+        return OperatorInput(now, quit=True)
+
+    def close(self) -> None:
+        pass
+
+
+def parse_script(text: str) -> list[Step]:
+    """``"stand:3, squat:6, walk:5@0.5/0/0"``: label, seconds, and optionally a velocity (m/s, m/s, rad/s)."""
+    steps = []
+    for part in text.split(","):
+        label, _, rest = part.strip().partition(":")
+        seconds, _, velocity = rest.partition("@")
+        try:
+            v = tuple(float(x) for x in velocity.split("/")) if velocity else (0.0, 0.0, 0.0)
+            steps.append(Step(label, float(seconds), (v[0], v[1], v[2])))
+        except (ValueError, IndexError):
+            raise Sim2realError(
+                f"script: got '{part.strip()}', expected LABEL:SECONDS or LABEL:SECONDS@FORWARD/LEFT/TURN, e.g. walk:5@0.5/0/0"
+            ) from None
+    return steps

@@ -1,0 +1,95 @@
+"""The pilot: runs skills. Each policy tick it takes the newest state and the operator's wish and sends joint targets.
+
+It owns nothing that could hurt: if it crashes, hangs or is killed, its last command grows old and the guardian damps.
+"""
+
+from __future__ import annotations
+
+from sim2real.channel import Channel
+from sim2real.clock import MonotonicClock, SimClock
+from sim2real.guardian import PILOT, Sink
+from sim2real.records import VECTOR, Layout, command_view, pilot_layout, state_view
+from sim2real.skills import SkillPlayer
+from sim2real.types import Mode, OperatorInput
+
+
+def layout_of(player: SkillPlayer) -> Layout:
+    """The Pilot layout for everything ``player`` may feed its policies."""
+    inputs: dict[str, tuple[str, ...]] = {}
+    for plan, policy in zip(player.plans, player.policies, strict=True):
+        contract = policy.contract
+        for name, array in plan.inputs.items():
+            size = array[0].size
+            known = {"joint_pos": contract.joint_names, "joint_vel": contract.joint_names, "skill": player.labels}
+            elements = known.get(name) or (VECTOR if size == 3 else tuple(f"e{i}" for i in range(size)))
+            key = f"{policy.contract.name}.{name}"
+            inputs[key] = tuple(elements[:size])
+    return pilot_layout(player.config.joint_names, inputs, player.labels)
+
+
+class Pilot:
+    """Call ``tick`` at the policy rate."""
+
+    def __init__(
+        self,
+        player: SkillPlayer,
+        clock: MonotonicClock | SimClock,
+        states: Channel,
+        operator: Channel,
+        requests: Channel,
+        published: Channel,
+        sink: Sink | None = None,
+    ):
+        self.player, self.clock = player, clock
+        self.states, self.operator, self.requests, self.published, self.sink = (
+            states,
+            operator,
+            requests,
+            published,
+            sink,
+        )
+        self.record = published.layout.new()
+        self.request = requests.layout.new()
+        self._state = state_view(states.record)
+        self._request_view = command_view(self.request, "command")
+        self._tick = 0
+
+    def tick(self, scheduled: float, lateness: float = 0.0, late: int = 0) -> None:
+        """One turn of the loop."""
+        clock, player, r = self.clock, self.player, self.record
+        start = clock.now()
+        if self.states.read():
+            self._state.time = float(self.states.record["state.time"][0])
+            self._state.imu_age = float(self.states.record["state.imu_age"][0])
+        wish = self._wish()
+        before = clock.now()
+        command = player.step(self._state, Mode(int(self.states.record["mode"][0])), wish, start)
+        after = clock.now()
+        for name in ("joint_pos", "joint_vel", "joint_torque", "kp", "kd"):
+            getattr(self._request_view, name)[:] = getattr(command, name)
+            r[f"command.{name}"][0] = getattr(command, name)
+        self.request["command.time"] = r["command.time"] = command.time
+        self.requests.write(self.request)
+        r["time"], r["tick"], r["late"] = scheduled, self._tick, late
+        r["stage"], r["policy"], r["skill"] = player.stage, player.policy_index, player.skill
+        r["refused"] = len(player.refusals)
+        r["operator.skill"] = self.operator.record["skill"][0]
+        r["operator.velocity"][0] = wish.velocity
+        r["operator.age"] = start - wish.time
+        name = player.policies[player.policy_index].contract.name
+        for signal, array in player.inputs.items():
+            r[f"input.{name}.{signal}"][0] = array[0]
+        r["skill_value"][0] = player.values
+        r["timing.lateness"], r["timing.policy"], r["timing.total"] = lateness, after - before, clock.now() - start
+        self.published.write(r)
+        if self.sink is not None:
+            self.sink.write(PILOT, scheduled, r)
+        self._tick += 1
+
+    def _wish(self) -> OperatorInput:
+        self.operator.read()
+        o = self.operator.record[0]
+        label = self.player.labels[o["skill"]] if 0 <= o["skill"] < len(self.player.labels) else None
+        return OperatorInput(
+            float(o["time"]), label, tuple(o["velocity"]), bool(o["arm"]), bool(o["stop"]), bool(o["quit"])
+        )

@@ -1,0 +1,153 @@
+"""Robot: joints on one side, motors on buses on the other. The only place that knows signs, offsets and order.
+
+Real and simulated robots are this same class; only the wires under the buses differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from drivers.open import open_bus, open_imu
+
+from drivers.bus import BusSpec, Clock, Imu, ImuSpec, MotorBus, MotorCommand
+from sim2real.config import RobotConfig, Wiring
+from sim2real.types import JointCommand, RobotState
+
+
+class Robot:
+    """All buses and the IMU of one wiring. ``read``, ``write``, ``poll``, ``enable``, ``disable`` never block."""
+
+    def __init__(self, config: RobotConfig, buses: Sequence[MotorBus], imu: Imu):
+        self.config = config
+        self.buses = list(buses)
+        self.imu = imu
+        motors = [m for bus in self.buses for m in bus.spec.motors]
+        joint_of_motor = config.indices([m.joint for m in motors])
+        self._motor_of_joint = np.argsort(joint_of_motor)
+        self._sign = np.array([m.sign for m in motors], float)[self._motor_of_joint]
+        self._offset = np.array([m.offset for m in motors], float)[self._motor_of_joint]
+        self._joint_of_motor = joint_of_motor
+        self._motor_sign = np.array([m.sign for m in motors], float)
+        self._motor_offset = np.array([m.offset for m in motors], float)
+        stops = np.cumsum([0] + [len(bus.spec.motors) for bus in self.buses])
+        self._command = np.zeros((5, len(motors)))  # position, velocity, kp, kd, torque of every motor
+        self._commands = [
+            MotorCommand(*(self._command[row, start:stop] for row in range(5)))
+            for start, stop in zip(stops[:-1], stops[1:], strict=True)
+        ]
+        mount = np.array(imu.spec.orientation_imu_in_base, float)
+        self._mount = mount / np.linalg.norm(mount)
+        self._mounted_straight = bool(np.allclose(np.abs(self._mount), (1, 0, 0, 0)))
+        self._mount_matrix = matrix_of(self._mount)
+
+    def connect(self, clock: Clock) -> None:
+        """Find and check every motor, program and read back every watchdog. Raises BusError naming the first misfit."""
+        for bus in self.buses:
+            bus.connect(clock)
+
+    def read(self, now: float, state: RobotState) -> None:
+        """Take in everything that arrived and fill ``state`` in place."""
+        states = [bus.read(now) for bus in self.buses]
+        order = self._motor_of_joint
+        state.time = now
+        np.subtract(np.concatenate([s.position for s in states])[order], self._offset, out=state.joint_pos)
+        state.joint_pos *= self._sign
+        np.multiply(np.concatenate([s.velocity for s in states])[order], self._sign, out=state.joint_vel)
+        np.multiply(np.concatenate([s.torque for s in states])[order], self._sign, out=state.joint_torque)
+        state.joint_temperature[:] = np.concatenate([s.temperature for s in states])[order]
+        state.joint_error[:] = np.concatenate([s.error for s in states])[order]
+        state.joint_enabled[:] = np.concatenate([s.enabled for s in states])[order]
+        np.subtract(now, np.concatenate([s.time for s in states])[order], out=state.joint_age)
+        imu = self.imu.read(now)
+        if self._mounted_straight:
+            state.orientation_base_in_world[:] = imu.orientation_imu_in_world
+            state.angular_velocity_base_in_base[:] = imu.angular_velocity_imu_in_imu
+            state.acceleration_base_in_base[:] = imu.acceleration_imu_in_imu
+        else:
+            state.orientation_base_in_world[:] = multiply(imu.orientation_imu_in_world, self._mount * (1, -1, -1, -1))
+            state.angular_velocity_base_in_base[:] = self._mount_matrix @ imu.angular_velocity_imu_in_imu
+            state.acceleration_base_in_base[:] = self._mount_matrix @ imu.acceleration_imu_in_imu
+        state.imu_age = now - imu.time
+
+    def write(self, command: JointCommand) -> None:
+        """Send one tick of joint targets. Raises BusError when a wire is gone (the other buses are still written)."""
+        of = self._joint_of_motor
+        sign = self._motor_sign
+        c = self._command
+        np.add(command.joint_pos[of] * sign, self._motor_offset, out=c[0])
+        np.multiply(command.joint_vel[of], sign, out=c[1])
+        c[2] = command.kp[of]
+        c[3] = command.kd[of]
+        np.multiply(command.joint_torque[of], sign, out=c[4])
+        self._each(lambda bus, i: bus.write(self._commands[i]))
+
+    def poll(self) -> None:
+        """Ask every motor for its state, commanding nothing."""
+        self._each(lambda bus, i: bus.poll())
+
+    def enable(self) -> None:
+        self._each(lambda bus, i: bus.enable())
+
+    def disable(self) -> None:
+        """Take torque off every motor. Never raises."""
+        for bus in self.buses:
+            bus.disable()
+
+    def error_name(self, joint: int, code: int) -> str:
+        """The motor protocol's name for a joint's error code."""
+        motor = int(self._motor_of_joint[joint])
+        for bus in self.buses:
+            if motor < len(bus.spec.motors):
+                return bus.error_name(code)
+            motor -= len(bus.spec.motors)
+        raise IndexError(joint)
+
+    def close(self) -> None:
+        for bus in self.buses:
+            bus.close()
+        self.imu.close()
+
+    def _each(self, act) -> None:
+        """Do it on every bus even if one fails, then raise the first failure: one dead bus must not silence four."""
+        first: Exception | None = None
+        for i, bus in enumerate(self.buses):
+            try:
+                act(bus, i)
+            except Exception as error:  # noqa: BLE001 - re-raised below
+                first = first or error
+        if first is not None:
+            raise first
+
+
+def open_robot(config: RobotConfig, wiring: Wiring, wires: Mapping[str, object] | None = None) -> Robot:
+    """Open the buses and the IMU of ``wiring``; ``wires`` (bus name or "imu" -> wire) replaces the real ones."""
+    wires = wires or {}
+    buses = [open_bus(spec, wires.get(spec.name)) for spec in wiring.bus_specs()]
+    return Robot(config, buses, open_imu(wiring.imu_spec(), wires.get("imu")))
+
+
+def simulated(bus: BusSpec | ImuSpec, directory: str):
+    """The spec of the same bus behind the sockets of a simulated world in ``directory``."""
+    from dataclasses import replace
+
+    name = bus.name if isinstance(bus, BusSpec) else "imu"
+    return replace(bus, interface="sim", channel=f"{directory}/{name}.sock")
+
+
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Hamilton product of two quaternions (4,), w first."""
+    w, v, x, u = a[0], a[1:], b[0], b[1:]
+    return np.concatenate([[w * x - v @ u], w * u + x * v + np.cross(v, u)])
+
+
+def matrix_of(q: np.ndarray) -> np.ndarray:
+    """Rotation matrix (3, 3) of a unit quaternion (4,), w first."""
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,268 @@
+"""Performing skills: soft start, the current label, guarded switches, and the policy's targets as a whole-robot command.
+
+``SkillPlayer`` is pure: robot state and operator's wish in, JointCommand out, time as an argument. The same object runs in
+the pilot process, in lockstep simulation and in replay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from sim2real.config import RobotConfig
+from sim2real.contract import CARRY, INPUTS, Contract
+from sim2real.types import JointCommand, Mode, OperatorInput, RobotState, Sim2realError
+
+
+class Stage(IntEnum):
+    """Where a run is."""
+
+    STANDBY = 0  # not armed: damping gains at the measured posture
+    ENGAGE = 1  # soft start: gains rise, then the joints move to where the policy expects to start
+    RUN = 2  # the policy drives
+
+
+class Runnable(Protocol):
+    """What a SkillPlayer needs of a policy (``sim2real.policy.Policy``)."""
+
+    contract: Contract
+
+    def reset(self) -> None: ...
+
+    def step(self, inputs: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]: ...
+
+
+class Refusal(NamedTuple):
+    """A skill switch that was not made, and why."""
+
+    skill: str
+    reason: str
+
+
+class SkillPlayer:
+    """Runs the skills of one or more policies on one robot.
+
+    Labels of all policies share one namespace (``labels``). A wish for another label is granted if the contract allows
+    the transition, the current skill has had its dwell time, and the policy expects to manage it (``value_min``);
+    otherwise ``refusals`` says why and the current skill goes on. Between two policies the targets blend.
+    """
+
+    gain_time = 0.6  # s for the gains to rise
+    move_time = 1.4  # s to move to the start posture after that
+    blend_time = 0.3  # s from one policy's targets to another's
+    operator_timeout = 0.5  # s: an operator older than this wants velocity zero
+
+    def __init__(self, config: RobotConfig, policies: Sequence[Runnable], extra: Mapping[str, object] | None = None):
+        if not policies:
+            raise Sim2realError(f"{config.name}: no policy to run; give one with --policy FILE.onnx")
+        self.config = config
+        self.policies = list(policies)
+        self.labels: list[str] = []
+        self._of_label: list[tuple[int, int]] = []  # policy, its own label index
+        for p, policy in enumerate(policies):
+            for k, label in enumerate(policy.contract.skill_labels):
+                if label in self.labels:
+                    raise Sim2realError(f"skill '{label}': two policies perform it; rename it in one of them")
+                self.labels.append(label)
+                self._of_label.append((p, k))
+        periods = {policy.contract.period for policy in policies}
+        if len(periods) > 1:
+            raise Sim2realError(f"policies: got periods {sorted(periods)} s, expected one; export them at one rate")
+        self.period = periods.pop()
+        self.plans = [_Plan(config, policy.contract) for policy in policies]
+        n = len(config.joint_names)
+        self.command = JointCommand(-np.inf, *(np.zeros(n) for _ in range(5)))
+        self.values = np.full(len(self.labels), np.nan)
+        self.stage = Stage.STANDBY
+        self.skill = self.labels.index(policies[0].contract.default_skill)
+        self.refusals: list[Refusal] = []
+        self._refused_wish: str | None = None
+        self._since = -np.inf  # when the current skill began
+        self._engaged = 0.0
+        self._from = np.zeros(n)
+        self._blend_from = np.zeros(n)
+        self._blend_start = -np.inf
+
+    @property
+    def policy_index(self) -> int:
+        return self._of_label[self.skill][0]
+
+    @property
+    def inputs(self) -> Mapping[str, np.ndarray]:
+        """What the current policy was last fed."""
+        return self.plans[self.policy_index].inputs
+
+    @property
+    def engage_time(self) -> float:
+        """Length of the soft start, s."""
+        return self.gain_time + self.move_time
+
+    def start_posture(self) -> np.ndarray:
+        """(n,) rad: where the soft start ends."""
+        return self.plans[self.policy_index].posture
+
+    def step(self, state: RobotState, mode: Mode, operator: OperatorInput, now: float) -> JointCommand:
+        """One policy tick. Returns the same JointCommand object each time; never raises on a bad state: that is the
+        gate's to judge, so a non-finite state yields the previous targets again."""
+        if mode != Mode.RUN and mode != Mode.HOLD:
+            self.stage = Stage.STANDBY
+        elif self.stage == Stage.STANDBY:
+            self.stage = Stage.ENGAGE
+            self._engaged = now
+            self._from[:] = state.joint_pos
+        if self.stage == Stage.ENGAGE and now - self._engaged >= self.engage_time:
+            self.stage = Stage.RUN
+            self._begin(now)
+        if self.stage == Stage.STANDBY:
+            self._standby(state)
+        elif self.stage == Stage.ENGAGE:
+            self._engage(now)
+        else:
+            self._run(state, operator, now)
+        self.command.time = now
+        return self.command
+
+    def _standby(self, state: RobotState) -> None:
+        c = self.command
+        np.copyto(c.joint_pos, state.joint_pos, where=np.isfinite(state.joint_pos))
+        c.kp[:] = 0.0
+        c.kd[:] = self.config.damping
+
+    def _engage(self, now: float) -> None:
+        plan, c = self.plans[self.policy_index], self.command
+        elapsed = now - self._engaged
+        gain = min(1.0, elapsed / self.gain_time)
+        s = min(1.0, max(0.0, (elapsed - self.gain_time) / self.move_time))
+        ease = s * s * (3 - 2 * s)  # starts and ends at rest
+        c.joint_pos[:] = self._from + ease * (plan.posture - self._from)
+        c.kp[:] = gain * plan.kp
+        c.kd[:] = self.config.damping + gain * (plan.kd - self.config.damping)
+
+    def _begin(self, now: float) -> None:
+        self.policies[self.policy_index].reset()
+        self._since = now
+
+    def _run(self, state: RobotState, operator: OperatorInput, now: float) -> None:
+        if operator.skill is not None and operator.skill != self.labels[self.skill]:
+            self._switch(operator.skill, now)
+        else:
+            self._refused_wish = None
+        p, k = self._of_label[self.skill]
+        plan, policy, c = self.plans[p], self.policies[p], self.command
+        fresh = now - operator.time <= self.operator_timeout
+        plan.fill(state, operator.velocity if fresh else (0.0, 0.0, 0.0), k)
+        if not plan.finite():
+            return
+        outputs = policy.step(plan.inputs)
+        c.joint_pos[:] = plan.posture
+        c.joint_pos[plan.targets] = outputs["joint_pos_target"]
+        c.kp[:] = plan.kp
+        c.kd[:] = plan.kd
+        w = (now - self._blend_start) / self.blend_time
+        if w < 1.0:
+            c.joint_pos[:] = self._blend_from + w * (c.joint_pos - self._blend_from)
+        if "skill_value" in outputs:
+            first = self.skill - k
+            self.values[first : first + len(policy.contract.skills)] = outputs["skill_value"]
+
+    def _switch(self, wish: str, now: float) -> None:
+        reason = self._objection(wish, now)
+        if reason is None:
+            before, self.skill = self.policy_index, self.labels.index(wish)
+            self._since = now
+            if self.policy_index != before:
+                self._blend_from[:] = self.command.joint_pos
+                self._blend_start = now
+                self.policies[self.policy_index].reset()
+        elif self._refused_wish != wish:  # say it once, not at 50 Hz
+            self.refusals.append(Refusal(wish, reason))
+        self._refused_wish = wish if reason else None
+
+    def _objection(self, wish: str, now: float) -> str | None:
+        current = self.labels[self.skill]
+        if wish not in self.labels:
+            return f"unknown label; expected one of {', '.join(self.labels)}"
+        p, k = self._of_label[self.skill]
+        here = self.policies[p].contract.skills[k]
+        if here.next is not None and wish not in here.next:
+            return f"'{current}' may only be followed by {', '.join(here.next) or 'nothing'}"
+        if now - self._since < here.dwell:
+            return f"'{current}' lasts at least {here.dwell:g} s"
+        q, j = self._of_label[self.labels.index(wish)]
+        least = self.policies[q].contract.skills[j].value_min
+        value = self.values[self.labels.index(wish)]
+        if least is not None and np.isfinite(value) and value < least:
+            return f"the policy expects {value:.2f} from it here, less than {least:.2f}"
+        return None
+
+
+class _Plan:
+    """How one policy's tensors map onto the robot's joints; buffers for its inputs."""
+
+    def __init__(self, config: RobotConfig, contract: Contract):
+        self.observed = config.indices(contract.joint_names)
+        self.targets = config.indices(contract.target_joint_names)
+        self.posture = config.home_pos.copy()
+        self.kp = config.home_kp.copy()
+        self.kd = config.home_kd.copy()
+        for name, hold in contract.hold.items():
+            i = config.indices([name])[0]
+            self.posture[i], self.kp[i], self.kd[i] = hold.position, hold.kp, hold.kd
+        self.posture[self.observed] = contract.default_joint_pos
+        self.kp[self.targets] = contract.kp
+        self.kd[self.targets] = contract.kd
+        self._low = np.array(contract.command_velocity_min)
+        self._high = np.array(contract.command_velocity_max)
+        signals = {name: shape for name, shape in contract.inputs.items() if not name.startswith(CARRY)}
+        self.inputs = {name: np.zeros((1, *shape), np.float32) for name, shape in signals.items()}
+        if strangers := [n for n in signals if n not in _SOURCES]:
+            raise Sim2realError(
+                f"{contract.name}: nothing on this robot measures {', '.join(strangers)}; it measures {', '.join(_SOURCES)}"
+            )
+        self._sources = [(_SOURCES[name], self.inputs[name][0]) for name in signals]
+
+    def fill(self, state: RobotState, velocity: tuple[float, float, float], skill: int) -> None:
+        for source, out in self._sources:
+            source(self, state, velocity, skill, out)
+
+    def finite(self) -> bool:
+        return all(np.isfinite(x).all() for x in self.inputs.values())
+
+
+def _joint_pos(plan, state, velocity, skill, out):
+    out[:] = state.joint_pos[plan.observed]
+
+
+def _joint_vel(plan, state, velocity, skill, out):
+    out[:] = state.joint_vel[plan.observed]
+
+
+def _orientation(plan, state, velocity, skill, out):
+    out[:] = state.orientation_base_in_world
+
+
+def _angular_velocity(plan, state, velocity, skill, out):
+    out[:] = state.angular_velocity_base_in_base
+
+
+def _command_velocity(plan, state, velocity, skill, out):
+    out[:] = np.clip(velocity, plan._low, plan._high)
+
+
+def _skill(plan, state, velocity, skill, out):
+    out[:] = 0.0
+    out[skill] = 1.0
+
+
+_SOURCES = {
+    "joint_pos": _joint_pos,
+    "joint_vel": _joint_vel,
+    "orientation_base_in_world": _orientation,
+    "angular_velocity_base_in_base": _angular_velocity,
+    "command_velocity": _command_velocity,
+    "skill": _skill,
+}
+assert set(_SOURCES) <= set(INPUTS)
