@@ -1,0 +1,133 @@
+"""HiPNUC HI91 packets (tag 0x91, floats), as sent by HI13/HI14 and CH0x0 IMUs: bytes to SI and back.
+
+    5A A5 | length u16 | crc u16 | payload (76 bytes)        little-endian
+
+The CRC-16 (polynomial 0x1021, initial value 0, most significant bit first, no final xor) runs over the first four bytes
+and then the payload. Source: HiPNUC "Command and Programming Manual", chapter on the serial binary protocol.
+The sensor says g, deg/s and deg; everything here is SI.
+"""
+
+from __future__ import annotations
+
+import binascii
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+GRAVITY = 9.80665  # m/s^2 in the maker's "1 g"
+HEAD = b"\x5a\xa5"
+HEAD_SIZE = 6
+LENGTH_MAX = 512  # bytes of payload; the sensor's largest packet is well below
+TAG = 0x91
+
+PAYLOAD = np.dtype(
+    [
+        ("tag", "u1"),
+        ("status", "<u2"),
+        ("temperature", "i1"),  # deg C
+        ("pressure", "<f4"),  # Pa
+        ("timestamp", "<u4"),  # ms since power-on
+        ("acceleration", "<f4", (3,)),  # g
+        ("angular_velocity", "<f4", (3,)),  # deg/s
+        ("magnetic_field", "<f4", (3,)),  # uT
+        ("roll_pitch_yaw", "<f4", (3,)),  # deg
+        ("orientation", "<f4", (4,)),  # w, x, y, z
+    ]
+)  # 76 bytes, packed
+HEADER = np.dtype([("head", "u1", (2,)), ("length", "<u2"), ("crc", "<u2")])
+
+
+class Hi91(NamedTuple):
+    """One packet, in the sensor's own frame."""
+
+    timestamp: float  # s since the sensor's power-on
+    temperature: float  # deg C
+    acceleration: np.ndarray  # (3,) m/s^2, +g upwards at rest
+    angular_velocity: np.ndarray  # (3,) rad/s
+    orientation: np.ndarray  # (4,) w, x, y, z
+    status: int
+
+
+def crc16(data: bytes, crc: int = 0) -> int:
+    """CRC-16/XMODEM of ``data``, continuing from ``crc``."""
+    return binascii.crc_hqx(data, crc)
+
+
+def pack(packet: Hi91) -> bytes:
+    """The packet as the sensor sends it (82 bytes)."""
+    payload = np.zeros(1, PAYLOAD)
+    payload["tag"] = TAG
+    payload["status"] = packet.status
+    payload["temperature"] = round(packet.temperature)
+    payload["timestamp"] = round(packet.timestamp * 1e3) & 0xFFFF_FFFF
+    payload["acceleration"] = np.asarray(packet.acceleration) / GRAVITY
+    payload["angular_velocity"] = np.rad2deg(packet.angular_velocity)
+    w, x, y, z = packet.orientation
+    payload["roll_pitch_yaw"] = np.rad2deg(
+        [
+            math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+            math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
+            math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        ]
+    )
+    payload["orientation"] = packet.orientation
+    return frame(payload.tobytes())
+
+
+def frame(payload: bytes) -> bytes:
+    """``payload`` with its header: sync bytes, length and CRC."""
+    start = HEAD + len(payload).to_bytes(2, "little")
+    return start + crc16(payload, crc16(start)).to_bytes(2, "little") + payload
+
+
+def unpack(payload: bytes) -> Hi91:
+    """A checked payload whose first byte is TAG, in SI units. Raises ValueError if it is shorter than PAYLOAD."""
+    p = np.frombuffer(payload, PAYLOAD, count=1)[0]
+    return Hi91(
+        timestamp=float(p["timestamp"]) * 1e-3,
+        temperature=float(p["temperature"]),
+        acceleration=p["acceleration"].astype(float) * GRAVITY,
+        angular_velocity=np.deg2rad(p["angular_velocity"].astype(float)),
+        orientation=p["orientation"].astype(float),
+        status=int(p["status"]),
+    )
+
+
+class Parser:
+    """Finds packets in a byte stream: split, joined, damaged or between other bytes. Keeps at most one packet back."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+        self.rejected = 0  # packets whose CRC or length was wrong
+
+    def feed(self, data: bytes) -> list[Hi91]:
+        """Every HI91 packet completed by ``data``, oldest first. Packets of other tags are skipped."""
+        buffer = self._bytes
+        buffer += data
+        packets = []
+        at = 0
+        while (start := buffer.find(HEAD, at)) >= 0:
+            at = start
+            if len(buffer) < at + HEAD_SIZE:
+                break
+            length = int.from_bytes(buffer[at + 2 : at + 4], "little")
+            end = at + HEAD_SIZE + length
+            if not 0 < length <= LENGTH_MAX:
+                self.rejected += 1
+                at += len(HEAD)
+                continue
+            if len(buffer) < end:
+                break
+            payload = bytes(buffer[at + HEAD_SIZE : end])
+            if crc16(payload, crc16(bytes(buffer[at : at + 4]))) != int.from_bytes(buffer[at + 4 : at + 6], "little"):
+                self.rejected += 1
+                at += len(HEAD)  # what looked like a header may hide a real one: search on right behind it
+                continue
+            if payload[0] == TAG and length >= PAYLOAD.itemsize:
+                packets.append(unpack(payload))
+            at = end
+        else:
+            at = len(buffer) - (buffer[-1:] == HEAD[:1])  # nothing begins in the rest, but its last byte may
+        del buffer[:at]
+        return packets
