@@ -60,20 +60,26 @@ class SafetyConfig(Strict):
     """Thresholds of the safety gate; every field is used by the rule of the same name in ``sim2real/safety``."""
 
     position_margin: Unsigned = 0.02  # rad inside the mechanical range
+    position_overrun: Unsigned = 0.1  # rad outside the mechanical range: measured beyond is a fault
     velocity_max_ratio: Positive = 1.2  # of each joint's velocity: measured above this is a fault
     target_velocity_ratio: Positive = 1.0  # slew: targets move at most this share of the joint's velocity
     torque_ratio: Positive = 1.0  # of each joint's torque: predicted PD torque is kept below this
+    jump_ratio: Positive = 3.0  # of each joint's velocity: a position that moved faster is an encoder jump
     tilt: Positive = 1.0  # rad between the base's up and gravity's
     angular_velocity: Positive = 12.0  # rad/s of the base
     temperature_warn: Positive = 80.0  # deg C
     temperature: Positive = 100.0  # deg C
     joint_age: Positive = 0.04  # s without feedback from a joint
     imu_age: Positive = 0.04  # s
+    imu_frozen: Positive = 4  # consecutive bit-identical gyro samples; one more is a fault
+    orientation_norm: Positive = 0.01  # distance of the base quaternion's norm from 1
+    enable_time: Positive = 0.1  # s, while armed, without a motor saying that it is enabled
     command_age_hold: Positive = 0.04  # s without a fresh command: hold
     command_age: Positive = 0.06  # s without a fresh command: damp
     hold_time: Positive = 0.04  # s: longest hold of any cause, then damp
     arm_tilt: Positive = 0.35  # rad: refuse to arm beyond
     arm_velocity: Positive = 0.5  # rad/s: refuse to arm while any joint moves faster
+    arm_gravity: Positive = 2.0  # m/s^2 between the measured acceleration and gravity: refuse to arm beyond
     tick_gap: Positive = 0.06  # s between two ticks of the gate: beyond it, it was suspended
 
 
