@@ -13,6 +13,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+
 from sim2real.recorder.schema import CDR_HEADER, PACKAGE, layout_to_json, ros2msg
 from sim2real.records import Layout
 from sim2real.types import Sim2realError
@@ -74,8 +76,10 @@ class Writer:
             for topic, layout in layouts.items()
         ]
 
-    def write(self, topic: int, time: float, record: bytes) -> bool:
-        """Append one record of the ``topic``-th layout, taken at ``time`` (s, monotonic). False: the disk is full."""
+    def write(self, topic: int, time: float, record: bytes | np.ndarray) -> bool:
+        """Append one record (bytes, or an array of shape (1,)) of the ``topic``-th layout, taken at ``time`` (s,
+        monotonic). False: the disk is full. Raises ValueError on a record of another size."""
+        record = bytes(record)
         if len(record) != self._sizes[topic]:
             raise ValueError(f"record of topic {topic}: got {len(record)} bytes, expected {self._sizes[topic]}")
         if not self._reserve(2 * CHUNK_SIZE):

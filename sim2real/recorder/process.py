@@ -24,6 +24,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import IO
 
+import numpy as np
+
 from sim2real.recorder.mcap import Writer, strings
 from sim2real.recorder.schema import layout_from_json, layout_to_json
 from sim2real.records import Layout
@@ -44,10 +46,12 @@ class Sink:
         self._id = os.getpid()
         self.dropped = [0] * topics
 
-    def write(self, topic: int, time: float, record: bytes) -> bool:
-        """Send one record of the ``topic``-th layout, taken at ``time`` (s, monotonic). False: dropped and counted."""
+    def write(self, topic: int, time: float, record: bytes | np.ndarray) -> bool:
+        """Send one record (bytes, or an array of shape (1,)) of the ``topic``-th layout, taken at ``time`` (s,
+        monotonic). False: dropped and counted."""
         try:
-            self._channel.sendmsg((ENVELOPE.pack(self._id, topic, self.dropped[topic], 0, time), record))
+            head = ENVELOPE.pack(self._id, topic, self.dropped[topic], 0, time)
+            self._channel.sendmsg((head, record))  # pyright: ignore[reportArgumentType] - an array is a buffer
             return True
         except OSError:  # full (EAGAIN, ENOBUFS), or the recorder is gone (EPIPE): the run goes on either way
             self.dropped[topic] += 1
@@ -164,7 +168,7 @@ class Direct:
     def sink(self) -> Direct:
         return self
 
-    def write(self, topic: int, time: float, record: bytes) -> bool:
+    def write(self, topic: int, time: float, record: bytes | np.ndarray) -> bool:
         written = self._writer.write(topic, time, record)
         self.dropped[topic] += not written
         return written
