@@ -100,6 +100,11 @@ class Guardian:
         self._publish(command, scheduled, lateness, late, calls, (start, read, judged, clock.now()))
         self._tick += 1
 
+    def stop_at_once(self) -> None:
+        """The way out when nothing else can be trusted: disable every motor. Never raises."""
+        self.safety.off()
+        self.robot.disable()
+
     def quit(self) -> None:
         """Damp, then switch off and be ``done``. Safe to call again and again."""
         if self._ending is None:
@@ -201,14 +206,52 @@ class Guardian:
             self.sink.write(TICK, scheduled, r)
 
 
-def guardian_layout(robot_joints: tuple[str, ...], buses: list[str]) -> Layout:
-    """The layout of the guardian's state channel and log topic."""
-    return tick_layout(robot_joints, buses)
-
-
 def _copy(source: JointCommand, target: JointCommand) -> None:
     target.joint_pos[:] = source.joint_pos
     target.joint_vel[:] = source.joint_vel
     target.joint_torque[:] = source.joint_torque
     target.kp[:] = source.kp
     target.kd[:] = source.kd
+
+
+def main(directory: Path) -> int:
+    """The guardian process of the run in ``directory``. Returns 0 after a regular end."""
+    life = Life()
+    spec = RunSpec.load(directory)
+    config, wiring = spec.open()
+    joints = config.joint_names
+    clock = MonotonicClock()
+    try:
+        robot = open_robot(config, wiring, simulated_in=str(directory) if spec.simulated else None)
+        robot.connect(clock)
+    except (BusError, WireError) as error:
+        tell(str(error), failed=True)
+        return 2
+    guardian = Guardian(
+        robot,
+        Safety(Limits.of(config)),
+        clock,
+        1.0 / wiring.rate,
+        channel(directory, "request", request_layout(joints)),
+        channel(directory, "operator", operator_layout()),
+        channel(directory, "tick", tick_layout(joints, [b.name for b in wiring.buses])),
+        sink(spec),
+        tell,
+    )
+    tell("ready", ready=True)
+
+    def goes_on() -> bool:
+        if not life.goes_on():
+            guardian.quit()
+        return not guardian.done
+
+    try:
+        keep_time(guardian.tick, guardian.period, spec, 80, goes_on)
+    finally:
+        guardian.stop_at_once()
+        robot.close()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

@@ -5,10 +5,14 @@ It owns nothing that could hurt: if it crashes, hangs or is killed, its last com
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 from sim2real.channel import Channel
 from sim2real.clock import MonotonicClock, SimClock
-from sim2real.guardian import PILOT, Sink
-from sim2real.records import VECTOR, Layout, command_view, pilot_layout, state_view
+from sim2real.guardian import PILOT, Sink, operator_layout, request_layout
+from sim2real.records import VECTOR, Layout, command_view, pilot_layout, state_view, tick_layout
+from sim2real.run import Life, RunSpec, channel, keep_time, sink, tell
 from sim2real.skills import SkillPlayer
 from sim2real.types import Mode, OperatorInput
 
@@ -93,3 +97,39 @@ class Pilot:
         return OperatorInput(
             float(o["time"]), label, tuple(o["velocity"]), bool(o["arm"]), bool(o["stop"]), bool(o["quit"])
         )
+
+
+def main(directory: Path) -> int:
+    """The pilot process of the run in ``directory``."""
+    from sim2real.policy import load_policy
+
+    life = Life()
+    spec = RunSpec.load(directory)
+    config, wiring = spec.open()
+    player = SkillPlayer(config, [load_policy(Path(p), config, isolate=False) for p in spec.policies])
+    joints = config.joint_names
+    pilot = Pilot(
+        player,
+        MonotonicClock(),
+        channel(directory, "tick", tick_layout(joints, [b.name for b in wiring.buses])),
+        channel(directory, "operator", operator_layout()),
+        channel(directory, "request", request_layout(joints)),
+        channel(directory, "pilot", layout_of(player)),
+        sink(spec),
+    )
+    tell("ready", ready=True)
+    refused = 0
+
+    def tick(scheduled: float, lateness: float, late: int) -> None:
+        nonlocal refused
+        pilot.tick(scheduled, lateness, late)
+        for refusal in player.refusals[refused:]:
+            tell(f"kept the current skill: {refusal.skill}: {refusal.reason}")
+        refused = len(player.refusals)
+
+    keep_time(tick, player.period, spec, 70, life.goes_on)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

@@ -6,11 +6,12 @@ Real and simulated robots are this same class; only the wires under the buses di
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from drivers.open import open_bus, open_imu
 
-from drivers.bus import BusSpec, Clock, Imu, ImuSpec, MotorBus, MotorCommand
+from drivers.bus import Clock, Imu, MotorBus, MotorCommand
 from sim2real.config import RobotConfig, Wiring
 from sim2real.types import JointCommand, RobotState
 
@@ -120,19 +121,20 @@ class Robot:
             raise first
 
 
-def open_robot(config: RobotConfig, wiring: Wiring, wires: Mapping[str, object] | None = None) -> Robot:
-    """Open the buses and the IMU of ``wiring``; ``wires`` (bus name or "imu" -> wire) replaces the real ones."""
+def open_robot(
+    config: RobotConfig, wiring: Wiring, wires: Mapping[str, object] | None = None, simulated_in: str | None = None
+) -> Robot:
+    """Open the buses and the IMU of ``wiring``.
+
+    ``wires`` (bus name or "imu" -> wire) replaces the real ones; ``simulated_in`` is the directory of a simulated world's
+    sockets, one per bus.
+    """
     wires = wires or {}
-    buses = [open_bus(spec, wires.get(spec.name)) for spec in wiring.bus_specs()]
-    return Robot(config, buses, open_imu(wiring.imu_spec(), wires.get("imu")))
-
-
-def simulated(bus: BusSpec | ImuSpec, directory: str):
-    """The spec of the same bus behind the sockets of a simulated world in ``directory``."""
-    from dataclasses import replace
-
-    name = bus.name if isinstance(bus, BusSpec) else "imu"
-    return replace(bus, interface="sim", channel=f"{directory}/{name}.sock")
+    buses, imu = wiring.bus_specs(), wiring.imu_spec()
+    if simulated_in is not None:
+        buses = [replace(b, interface="sim", channel=f"{simulated_in}/{b.name}.sock") for b in buses]
+        imu = replace(imu, interface="sim", channel=f"{simulated_in}/imu.sock")
+    return Robot(config, [open_bus(b, wires.get(b.name)) for b in buses], open_imu(imu, wires.get("imu")))
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -100,6 +100,10 @@ class SkillPlayer:
         """Length of the soft start, s."""
         return self.gain_time + self.move_time
 
+    def engaged_for(self, now: float) -> float:
+        """Seconds since the soft start began."""
+        return now - self._engaged
+
     def start_posture(self) -> np.ndarray:
         """(n,) rad: where the soft start ends."""
         return self.plans[self.policy_index].posture

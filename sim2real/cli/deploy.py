@@ -1,0 +1,259 @@
+"""Run a robot: stand up, perform skills, damp. Simulated motors unless --hardware."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+from dataclasses import asdict, dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from sim2real.config import RobotConfig, load_robot
+from sim2real.operators.script import ScriptOperator, Step, parse_script
+from sim2real.types import Sim2realError
+
+
+@dataclass
+class Args:
+    """Run a robot: stand up, perform skills, damp.
+
+    By default the robot is simulated down to the bytes on its buses; with --hardware the same program drives real motors.
+    """
+
+    robot: str
+    """a robot of configs/robots, or the path of a YAML"""
+    wiring: str = ""
+    """which of the robot's wirings; default: its default"""
+    policy: list[Path] = field(default_factory=list)
+    """policy files; default: those the robot's YAML names"""
+    skill: str = ""
+    """perform only this skill"""
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """with --skill: forward m/s, left m/s, turn rad/s"""
+    duration: float = 0.0
+    """with --skill: seconds; default 10"""
+    script: str = ""
+    """a timeline, as in "stand:3,squat:6,walk:5@0.5/0/0"; default: every skill in turn"""
+    operator: Literal["script", "keyboard"] = "script"
+    """who picks the skill"""
+    clock: Literal["realtime", "lockstep"] = "realtime"
+    """lockstep: faster than real time and deterministic, simulation only"""
+    seed: int = 0
+    """of everything random in the simulation"""
+    fault: list[str] = field(default_factory=list)
+    """faults of the simulated wire, as in drop:0.1 or off:left_leg/left_knee_joint@5"""
+    record: Path = Path("runs")
+    """where records go: a directory, or an .mcap file"""
+    no_record: bool = False
+    """write no record"""
+    json: Annotated[Path | None, tyro.conf.arg(name="json")] = None
+    """write the summary to this file"""
+    video: Path | None = None
+    """with lockstep: render the run to this .gif"""
+    untuned: bool = False
+    """do not ask the kernel for real-time scheduling"""
+    hardware: bool = False
+    """drive real motors"""
+
+
+def main(argv: list[str]) -> int:
+    args = tyro.cli(Args, args=argv, prog="sim2real deploy", description=__doc__)
+    console = Console()
+    config = load_robot(args.robot)
+    _check(args, config)
+    policies, paths = _policies(args, config, console)
+    from sim2real.skills import SkillPlayer
+
+    player = SkillPlayer(config, policies)
+    operator = _operator(args, player.labels)
+    record = None if args.no_record else _record_path(args.record, config.name)
+    run = _lockstep if args.clock == "lockstep" else _realtime
+    with contextlib.suppress(KeyboardInterrupt):
+        summary = run(args, config, player, policies, paths, operator, record, console)
+        if args.json:
+            args.json.write_text(json.dumps(summary.as_dict(), indent=1) + "\n")
+        from sim2real.console import print_summary
+
+        print_summary(console, summary)
+        return 1 if summary.fell or summary.faults else 0
+    return 130
+
+
+def _check(args: Args, config: RobotConfig) -> None:
+    if args.hardware and args.clock == "lockstep":
+        raise Sim2realError("--hardware with --clock lockstep: a real robot runs in real time; drop one of the two")
+    if args.hardware and (args.fault or args.video):
+        raise Sim2realError("--hardware with --fault or --video: those exist only in simulation; drop them")
+    if args.video and args.clock != "lockstep":
+        raise Sim2realError("--video in real time: rendering would make the loop late; add --clock lockstep")
+    if args.operator == "keyboard" and args.clock == "lockstep":
+        raise Sim2realError("--operator keyboard with --clock lockstep: nobody types that fast; use --clock realtime")
+    if (args.velocity != (0.0, 0.0, 0.0) or args.duration) and not args.skill:
+        raise Sim2realError("--velocity and --duration belong to one skill: add --skill, or write a --script")
+    if args.skill and args.script:
+        raise Sim2realError("--skill and --script: got both, expected one")
+    config.wiring(args.wiring)
+
+
+def _policies(args: Args, config: RobotConfig, console: Console):
+    from sim2real.policy import load_policy
+
+    root = Path(__file__).resolve().parents[2]
+    paths = args.policy or [root / entry.file for entry in config.policies.values()]
+    if not paths:
+        raise Sim2realError(f"{config.name}: its YAML names no policy; give one with --policy FILE.onnx")
+    policies = [load_policy(path, config) for path in paths]
+    for policy in policies:
+        contract = policy.contract
+        console.print(
+            f"[bold]{contract.name}[/] for {contract.robot}: {', '.join(contract.skill_labels)} "
+            f"({1 / contract.period:.0f} Hz, {len(contract.target_joint_names)} joints, sha256 {policy.sha256[:12]})"
+        )
+    return policies, paths
+
+
+def _operator(args: Args, labels: list[str]):
+    if args.operator == "keyboard":
+        from sim2real.operators.keyboard import KeyboardOperator
+
+        return KeyboardOperator(labels)
+    if args.script:
+        steps = parse_script(args.script)
+    elif args.skill:
+        steps = [Step(args.skill, args.duration or 10.0, args.velocity)]
+    else:
+        steps = [Step(labels[0], 2.0), *(Step(label, 5.0) for label in labels[1:]), Step(labels[0], 2.0)]
+    for step in steps:
+        if step.skill not in labels:
+            import difflib
+
+            close = difflib.get_close_matches(str(step.skill), labels, n=1)
+            hint = f" (did you mean '{close[0]}'?)" if close else ""
+            raise Sim2realError(f"skill '{step.skill}': no policy performs it{hint}; they perform {', '.join(labels)}")
+    return ScriptOperator(steps)
+
+
+def _record_path(where: Path, robot: str) -> Path:
+    if where.suffix == ".mcap":
+        return where
+    return where / f"{robot}-{datetime.now():%Y%m%d-%H%M%S}.mcap"
+
+
+def _about(args: Args, config: RobotConfig, policies, paths) -> tuple[dict[str, object], dict[str, bytes]]:
+    """Metadata and attachments that make a record self-contained."""
+    import platform
+
+    from sim2real.cli import version
+
+    metadata = {
+        "robot": config.name,
+        "wiring": args.wiring or config.default_wiring,
+        "clock": args.clock,
+        "seed": args.seed,
+        "arguments": json.dumps({k: str(v) for k, v in asdict(args).items()}),
+        "skills": json.dumps([label for p in policies for label in p.contract.skill_labels]),
+        "policies": json.dumps(
+            [{"file": Path(f).name, "sha256": p.sha256} for p, f in zip(policies, paths, strict=True)]
+        ),
+        "version": version(),
+        "revision": _revision(),
+        "python": platform.python_version(),
+        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
+    }
+    attachments = {"robot.yaml": config.path.read_bytes(), "run.json": json.dumps(metadata).encode()}
+    for path in paths:
+        attachments[Path(path).name] = Path(path).read_bytes()
+    return metadata, attachments
+
+
+def _revision() -> str:
+    root = Path(__file__).resolve().parents[2]
+    done = subprocess.run(
+        ["git", "-C", root, "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
+    )
+    return done.stdout.strip() if done.returncode == 0 else ""
+
+
+def _lockstep(args, config, player, policies, paths, operator, record, console):
+    from drivers.sim.wire import parse_faults
+    from sim2real.recorder.process import Direct
+    from sim2real.simulation import Scene, Simulation
+
+    sink = None
+
+    def sink_for(ticks, pilots):
+        nonlocal sink
+        sink = Direct(record, {"/tick": ticks, "/pilot": pilots}, *_about(args, config, policies, paths))
+        return sink
+
+    camera = None
+    if args.video:
+        from sim2real.video import Camera
+
+        camera = Camera(args.video)
+    simulation = Simulation(
+        config,
+        policies,
+        operator,
+        Scene(seed=args.seed, faults=parse_faults(args.fault)),
+        args.wiring,
+        sink_for if record else None,
+        camera,
+        tell=lambda text: console.print(f"  {text}", style="yellow"),
+    )
+    summary = simulation.run()
+    if sink is not None:
+        sink.close()
+        summary.record = str(record)
+    if camera is not None:
+        camera.save()
+        console.print(f"video {args.video}")
+    return summary
+
+
+def _realtime(args, config, player, policies, paths, operator, record, console):
+    from sim2real.console import Status
+    from sim2real.launch import Launch
+    from sim2real.operators.keyboard import KEYS
+    from sim2real.pilot import layout_of
+    from sim2real.recorder.process import Recorder
+    from sim2real.records import tick_layout
+
+    recorder = None
+    if record:
+        buses = [b.name for b in config.wiring(args.wiring).buses]
+        layouts = {"/tick": tick_layout(config.joint_names, buses), "/pilot": layout_of(player)}
+        recorder = Recorder(record, layouts, *_about(args, config, policies, paths))
+    try:
+        with Status(console, KEYS if args.operator == "keyboard" else "") as status:
+            launch = Launch(
+                config,
+                player,
+                paths,
+                operator,
+                args.wiring,
+                simulated=not args.hardware,
+                tune=not args.untuned,
+                seed=args.seed,
+                faults=args.fault,
+                recorder=recorder,
+                show=status.show,
+                timeout=10.0 if args.operator == "script" else 3600.0,
+            )
+            summary = launch.run()
+    finally:
+        if recorder is not None:
+            recorder.close()
+    if record:
+        summary.record = str(record)
+    return summary
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,273 @@
+"""A run in real time: starts its processes, watches them, and ends them so that the robot is never left with torque.
+
+World (simulation only), recorder, guardian and pilot are processes; this one is the operator's. If the guardian dies, the
+last will is executed here: the buses are opened again and damping is streamed until the end. If this process dies too,
+the motors' own watchdogs are what is left.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2real.channel import run_directory
+from sim2real.clock import MonotonicClock, Schedule
+from sim2real.config import RobotConfig
+from sim2real.guardian import operator_layout
+from sim2real.operators import Operator, store
+from sim2real.pilot import layout_of
+from sim2real.records import tick_layout
+from sim2real.robot import open_robot
+from sim2real.run import RunSpec, channel
+from sim2real.simulation import support
+from sim2real.skills import SkillPlayer, Stage
+from sim2real.summary import Measures, Summary
+from sim2real.types import JointCommand, Mode, Sim2realError
+
+
+class Child:
+    """A process of the run: ``python -m module directory``, its stdin our sign of life, its stdout its messages."""
+
+    def __init__(self, module: str, directory: Path, inherit: Sequence[int] = ()):
+        self.module = module
+        root = str(Path(__file__).resolve().parents[1])
+        path = os.pathsep.join(filter(None, (root, os.environ.get("PYTHONPATH"))))
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", module, str(directory)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+            pass_fds=list(inherit),
+            env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
+        )
+        assert self.process.stdin and self.process.stdout
+        os.set_blocking(self.process.stdout.fileno(), False)
+        self._text = b""
+
+    def messages(self) -> list[dict[str, Any]]:
+        """What it said since the last call. Never blocks."""
+        assert self.process.stdout
+        try:
+            while chunk := os.read(self.process.stdout.fileno(), 65536):
+                self._text += chunk
+        except BlockingIOError:
+            pass
+        *lines, self._text = self._text.split(b"\n")
+        return [json.loads(line) for line in lines if line.startswith(b"{")]
+
+    def ready(self, timeout: float) -> None:
+        """Wait until it says so. Raises Sim2realError with what it said instead."""
+        clock, said = MonotonicClock(), []
+        end = clock.now() + timeout
+        while clock.now() < end:
+            select.select([self.process.stdout], [], [], 0.05)
+            for message in self.messages():
+                if message.get("ready"):
+                    return
+                if message.get("failed"):
+                    raise Sim2realError(message["text"])
+                said.append(message["text"])
+            if self.process.poll() is not None:
+                break
+        raise Sim2realError(
+            f"{self.module}: not ready within {timeout:g} s (exit {self.process.poll()}); {' '.join(said) or 'it said nothing'}"
+        )
+
+    def end(self, timeout: float) -> None:
+        """Close its stdin and wait; kill it if it does not go."""
+        if self.process.stdin:
+            self.process.stdin.close()
+        try:
+            self.process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+@dataclass
+class Launch:
+    """Build it, then ``run()``. ``show(launch)`` is called at 10 Hz with everything public here."""
+
+    config: RobotConfig
+    player: SkillPlayer
+    policy_paths: Sequence[Path]
+    operator: Operator
+    wiring: str = ""
+    simulated: bool = True
+    tune: bool = True
+    seed: int = 0
+    faults: Sequence[str] = ()
+    recorder: Any = None  # a started sim2real.recorder.process.Recorder
+    show: Callable[[Launch], None] = lambda launch: None
+    gantry: bool = True
+    messages: list[str] = field(default_factory=list)
+    timeout: float = 10.0  # s to be armed and through the soft start, counted from the wish to arm
+
+    def __post_init__(self) -> None:
+        self.wiring = self.wiring or self.config.default_wiring
+        self.directory = run_directory()
+        wired = self.config.wiring(self.wiring)
+        inherit = self.recorder.sink.fileno() if self.recorder else -1
+        self.spec = RunSpec(
+            robot=str(self.config.path.absolute()),
+            wiring=self.wiring,
+            simulated=self.simulated,
+            policies=[str(Path(p).absolute()) for p in self.policy_paths],
+            tune=self.tune,
+            recorder=inherit,
+            seed=self.seed,
+            faults=list(self.faults),
+        )
+        self.spec.save(self.directory)
+        self.states = channel(
+            self.directory, "tick", tick_layout(self.config.joint_names, [b.name for b in wired.buses])
+        )
+        self.pilot_states = channel(self.directory, "pilot", layout_of(self.player))
+        self._wishes = channel(self.directory, "operator", operator_layout())
+        self._wish = self._wishes.layout.new()
+        self.measures = Measures(self.config, wired, self.player)
+        self.clock = MonotonicClock()
+        self.children: dict[str, Child] = {}
+        self.world: Any = None
+        self.since = -1.0
+        self._inherit = [inherit] if inherit >= 0 else []
+        self._over = threading.Event()
+
+    @property
+    def stage(self) -> Stage:
+        return Stage(int(self.pilot_states.record["stage"][0]))
+
+    @property
+    def skill(self) -> str:
+        return self.player.labels[int(self.pilot_states.record["skill"][0])]
+
+    @property
+    def mode(self) -> Mode:
+        return Mode(int(self.states.record["mode"][0])) if self.states.record["tick"][0] else Mode.OFF
+
+    def run(self) -> Summary:
+        """The whole run. Always ends with every motor damped, then off, whatever happens in between."""
+        try:
+            self._start()
+            self._operate()
+        finally:
+            self._end()
+        return self.measures.summary(self.messages, self.player)
+
+    def _start(self) -> None:
+        if self.simulated:
+            from drivers.sim.socket_wire import WorldRemote
+
+            self._child("world", "sim2real.world").ready(20.0)
+            self.world = WorldRemote(self.directory / "world.sock")
+            if self.gantry:
+                self.world.gantry.hold()
+        guardian = self._child("guardian", "sim2real.guardian")
+        pilot = self._child("pilot", "sim2real.pilot")
+        guardian.ready(20.0)
+        pilot.ready(30.0)
+        threading.Thread(target=self._last_will, daemon=True).start()
+
+    def _child(self, name: str, module: str) -> Child:
+        child = self.children[name] = Child(module, self.directory, [] if name == "world" else self._inherit)
+        return child
+
+    def _operate(self) -> None:
+        schedule = Schedule(self.clock, 0.02)
+        schedule.start()
+        running: float | None = None
+        asked: float | None = None
+        guardian = self.children["guardian"].process
+        n = 0
+        while guardian.poll() is None:
+            schedule.wait()
+            now = self.clock.now()
+            self.states.read()
+            self.pilot_states.read()
+            if running is None and self.stage == Stage.RUN and self.mode == Mode.RUN:
+                running = now
+            self.since = now - running if running is not None else -1.0
+            wish = self.operator.read(now, self.since)
+            asked = asked or (now if wish.arm else None)
+            store(wish, self.player.labels, self._wish)
+            if running is None and asked is not None and now - asked > self.timeout:
+                self._wish["quit"] = 1
+            self._wishes.write(self._wish)
+            if self.world is not None:
+                if self.gantry:
+                    support(self.world.gantry, self.stage, self.player.gain_time, self._engaged(now), self.since)
+                self.measures.observe(self.world, self.states.record, self.pilot_states.record, self.since)
+            self.measures.tick(self.states.record)
+            self._listen()
+            if n % 5 == 0:
+                self.show(self)
+            n += 1
+        self._listen()
+        self.show(self)
+
+    def _engaged(self, now: float) -> float:
+        if self.stage == Stage.STANDBY:
+            self._engaging = now
+        return now - getattr(self, "_engaging", now)
+
+    def _listen(self) -> None:
+        for name, child in self.children.items():
+            for message in child.messages():
+                self.messages.append(f"{name}: {message['text']}")
+        if self.recorder is not None:
+            self.messages += [f"recorder: {text}" for text in self.recorder.poll()]
+
+    def _last_will(self) -> None:
+        """If the guardian ends other than regularly, damp the robot from here."""
+        process = self.children["guardian"].process
+        if process.wait() == 0 or self._over.is_set():
+            return
+        self.messages.append(f"guardian: died (exit {process.returncode}); damping from the launcher")
+        n = len(self.config.joint_names)
+        zero = np.zeros(n)
+        robot = open_robot(
+            self.config,
+            self.config.wiring(self.wiring),
+            simulated_in=str(self.directory) if self.simulated else None,
+        )
+        damp = JointCommand(0.0, zero, zero, zero, zero, self.config.damping)
+        schedule = Schedule(self.clock, 0.005)
+        schedule.start(self.clock.now())
+        for _ in range(400):  # 2 s: longer than any fall
+            schedule.wait()
+            try:
+                robot.write(damp)
+            except Exception as error:  # noqa: BLE001 - go on with the buses that still work
+                self.messages.append(str(error))
+        robot.disable()
+        robot.close()
+
+    def _end(self) -> None:
+        for name in ("pilot", "guardian"):
+            if name in self.children:
+                child = self.children[name]
+                if name == "guardian" and child.process.poll() not in (None, 0):
+                    self._wait_for_will()
+                child.end(5.0)
+        self._over.set()
+        self._listen()
+        if "world" in self.children:
+            self.children["world"].end(3.0)
+        self.operator.close()
+        shutil.rmtree(self.directory, ignore_errors=True)
+
+    def _wait_for_will(self) -> None:
+        for thread in threading.enumerate():
+            if thread.name.endswith("(_last_will)"):
+                thread.join(5.0)

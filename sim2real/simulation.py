@@ -1,0 +1,147 @@
+"""A whole run in one process and in lockstep: the production classes on a simulated clock, faster than real time.
+
+Everything above the wire is what runs on a robot. Only time is different: the guardian's sleep advances the world, and the
+pilot ticks right after the guardian tick that is due with it, so its command reaches the motors one bus tick later, as it
+would from a process of its own. Same seed, same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drivers.sim.world import World
+from sim2real.channel import Channel
+from sim2real.clock import Schedule, SimClock
+from sim2real.config import RobotConfig
+from sim2real.guardian import Guardian, Sink, operator_layout, request_layout
+from sim2real.operators import Operator, store
+from sim2real.pilot import Pilot, layout_of
+from sim2real.records import tick_layout
+from sim2real.robot import open_robot
+from sim2real.safety import Limits, Safety
+from sim2real.skills import Runnable, SkillPlayer, Stage
+from sim2real.summary import Measures, Summary
+
+
+@dataclass
+class Scene:
+    """What a simulation is besides the robot: randomness, faults, and what happens to the body.
+
+    ``prepare(spec)`` alters the MuJoCo model before it is compiled. ``pushes``: (seconds since the policy took over,
+    velocity change of the base (3,) m/s).
+    """
+
+    seed: int = 0
+    faults: Sequence[object] = ()
+    prepare: Callable | None = None
+    pushes: Sequence[tuple[float, tuple[float, float, float]]] = ()
+    gantry: bool = True
+    timestep: float = 0.002  # s
+    visuals: str = ""  # MJCF with meshes to merge for rendering
+
+
+@dataclass
+class Simulation:
+    """Build it, then ``run()``. ``each_tick(simulation)`` is called after every guardian tick (rendering, probes)."""
+
+    config: RobotConfig
+    policies: Sequence[Runnable]
+    operator: Operator
+    scene: Scene = field(default_factory=Scene)
+    wiring: str = ""
+    sink_for: Callable[..., Sink] | None = None  # (tick layout, pilot layout) -> Sink
+    each_tick: Callable[[Simulation], None] | None = None
+    tell: Callable[[str], None] = lambda text: None
+    timeout: float = 10.0  # s to be armed and through the soft start
+
+    def __post_init__(self) -> None:
+        wiring = self.config.wiring(self.wiring)
+        player = SkillPlayer(self.config, self.policies)
+        scene = self.scene
+        self.world = World(
+            self.config.model_path,
+            self.config.base,
+            wiring.bus_specs(),
+            wiring.imu_spec(),
+            timestep=scene.timestep,
+            seed=scene.seed,
+            faults=scene.faults,
+            prepare=scene.prepare,
+            joint_pos=dict(zip(self.config.joint_names, player.start_posture(), strict=True)),
+        )
+        self.clock = SimClock(self.world.advance, lambda: self.world.time)
+        joints = self.config.joint_names
+        ticks = tick_layout(joints, [b.name for b in wiring.buses])
+        pilots = layout_of(player)
+        states, operator = Channel(ticks), Channel(operator_layout())
+        requests, published = Channel(request_layout(joints)), Channel(pilots)
+        sink = self.sink_for(ticks, pilots) if self.sink_for else None
+        self.robot = open_robot(self.config, wiring, {**self.world.wires, "imu": self.world.imu_wire})
+        self.safety = Safety(Limits.of(self.config))
+        period = 1.0 / wiring.rate
+        self.guardian = Guardian(
+            self.robot, self.safety, self.clock, period, requests, operator, states, sink, self._tell
+        )
+        self.pilot = Pilot(player, self.clock, states, operator, requests, published, sink)
+        self.player = player
+        self._operator_channel = operator
+        self._operator_record = operator.layout.new()
+        self.every = round(player.period / period)
+        self.schedule = Schedule(self.clock, period)
+        self.since = -1.0  # s since the policy took over; negative before
+        self.messages: list[str] = []
+        self.measures = Measures(self.config, wiring, player)
+
+    def _tell(self, text: str) -> None:
+        self.messages.append(text)
+        self.tell(text)
+
+    def run(self) -> Summary:
+        """Connect, arm, perform the operator's timeline, damp, switch off. Raises BusError if a motor is missing."""
+        world, gantry = self.world, self.world.plant.gantry
+        if self.scene.gantry:
+            gantry.hold()
+        self.robot.connect(self.clock)
+        self.schedule.start()
+        began = self.clock.now()
+        running: float | None = None
+        pushes = list(self.scene.pushes)
+        while not self.guardian.done:
+            due = self.schedule.wait()
+            now = self.clock.now()
+            stage = self.player.stage
+            if running is None and stage == Stage.RUN:
+                running = now
+            self.since = now - running if running is not None else -1.0
+            if self.scene.gantry:
+                support(gantry, stage, self.player.gain_time, self.player.engaged_for(now), self.since)
+            while pushes and 0 <= pushes[0][0] <= self.since:
+                world.plant.push(np.asarray(pushes.pop(0)[1]))
+            store(self.operator.read(now, self.since), self.player.labels, self._operator_record)
+            self._operator_channel.write(self._operator_record)
+            self.guardian.tick(due, self.schedule.lateness, self.schedule.late)
+            if self.guardian.record["tick"][0] % self.every == 0:
+                self.pilot.tick(due)
+                self.measures.observe(world, self.guardian.record, self.pilot.record, self.since)
+            self.measures.tick(self.guardian.record)
+            if self.each_tick is not None:
+                self.each_tick(self)
+            if running is None and now - began > self.timeout:
+                self._tell(f"the policy never took over within {self.timeout:g} s")
+                self.guardian.quit()
+        summary = self.measures.summary(self.messages, self.player, wire_sha256=world.sha256())
+        self.robot.close()
+        self.operator.close()
+        return summary
+
+
+def support(gantry, stage: Stage, gain_time: float, engaged: float, since: float) -> None:
+    """What the person at the crane does: holds until the gains are up (``engaged`` s into the soft start), sets the robot
+    down, and lets go once the policy has it (``since`` s)."""
+    if stage == Stage.ENGAGE and gantry.holding and engaged > gain_time:
+        gantry.lower()
+    elif since > 0.4:
+        gantry.release()
