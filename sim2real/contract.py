@@ -7,6 +7,7 @@ is called, its shape, unit and frame, and its LEAPP ``kind``, so that export to 
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, model_validator
@@ -125,7 +126,7 @@ class Contract(Strict):
     history: str = "inside the graph"
     envelope: dict[str, Envelope] = {}
     golden: Annotated[list[Golden], Field(min_length=1)]
-    golden_tolerance: Positive = 1e-4
+    golden_tolerance: Annotated[float, Field(gt=0, le=1e-3)] = 1e-4
     provenance: Provenance
 
     @property
@@ -173,6 +174,44 @@ class Contract(Strict):
                 raise ValueError(f"carry: '{name}' needs the input '{name}' and the output '{name}_next'")
             if self.inputs[name] != carry.shape or self.outputs[f"{name}_next"] != carry.shape:
                 raise ValueError(f"carry: '{name}' has shape {self.inputs[name]} in the graph, {carry.shape} declared")
+            if carry.start and len(carry.start) != math.prod(carry.shape):
+                got = len(carry.start)
+                raise ValueError(
+                    f"carry: '{name}' starts from {got} numbers, expected {math.prod(carry.shape)} or none"
+                )
         if strangers := [n for n in self.inputs if n.startswith(CARRY) and n not in self.carry]:
             raise ValueError(f"carry: nothing says how {strangers} start")
+        if driven := [n for n in self.hold if n in self.target_joint_names]:
+            raise ValueError(f"hold: {driven} are in target_joint_names too, expected joints that are not driven")
+        if "skill_value" not in self.outputs and (gated := [s.label for s in self.skills if s.value_min is not None]):
+            raise ValueError(f"skills: {gated} have a value_min, expected an output 'skill_value' to compare it with")
+        for low, high in zip(self.command_velocity_min, self.command_velocity_max, strict=True):
+            if not low <= high:
+                raise ValueError(f"command_velocity_max: got {high} below the minimum {low}, expected min <= max")
+        return self
+
+    @model_validator(mode="after")
+    def _recorded(self) -> Contract:
+        """Envelope and golden sequences fit the signals they are about."""
+        for name, envelope in self.envelope.items():
+            if name not in self.inputs:
+                raise ValueError(f"envelope: got '{name}', expected one of {sorted(self.inputs)}")
+            size = math.prod(self.inputs[name])
+            for key, values in envelope:
+                if len(values) != size:
+                    raise ValueError(f"envelope.{name}.{key}: got {len(values)} numbers, expected {size}")
+        signals = {n for n in self.inputs if not n.startswith(CARRY)}
+        for k, golden in enumerate(self.golden):
+            if set(golden.inputs) != signals:
+                raise ValueError(f"golden[{k}].inputs: got {sorted(golden.inputs)}, expected {sorted(signals)}")
+            if "joint_pos_target" not in golden.outputs or not set(golden.outputs) <= set(self.outputs):
+                raise ValueError(
+                    f"golden[{k}].outputs: got {sorted(golden.outputs)}, expected joint_pos_target"
+                    f" and any of {sorted(self.outputs)}"
+                )
+            for side, shapes in (("inputs", self.inputs), ("outputs", self.outputs)):
+                for name, rows in getattr(golden, side).items():
+                    size = math.prod(shapes[name])
+                    if len(rows) != golden.steps or any(len(row) != size for row in rows):
+                        raise ValueError(f"golden[{k}].{side}.{name}: expected {golden.steps} rows of {size} numbers")
         return self

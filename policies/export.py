@@ -1,0 +1,218 @@
+"""Export: from a torch module to one policy file under the contract, with golden sequences inside.
+
+A module is exported as it trains: called with a dict of named tensors (batch, *shape), it returns a dict of named tensors
+(see ``sim2real.contract.INPUTS`` and ``OUTPUTS``; a carry ``carry_x`` goes in, ``carry_x_next`` comes out)::
+
+    class Basics(torch.nn.Module):
+        def forward(self, inputs: dict[str, Tensor]) -> dict[str, Tensor]: ...
+
+    export(Basics(), "basics.onnx", fields=dict(name="basics", robot="g1", ...), sequences=[...])
+
+Same module, fields and sequences: same bytes. ``pack`` is the half that needs no torch; ``policies.adopt`` uses it too.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from sim2real.config import RobotConfig, explain, load_robot
+from sim2real.contract import CARRY, METADATA_KEY, Contract
+from sim2real.graph import seal
+from sim2real.policy import Policy, PolicyError, load_policy
+
+if TYPE_CHECKING:
+    from onnx import ModelProto
+    from torch import Tensor, nn
+
+OPSET = 18
+IR_VERSION = 10
+SEQUENCES = 3  # at least, of golden inputs
+STEPS = 20  # at least, in each
+
+
+def pack(model: ModelProto, contract: Contract, path: str | Path, robot: RobotConfig | None = None) -> Policy:
+    """Write ``model`` with its contract to ``path`` and prove the file; ``path`` is touched only by a file that loads.
+
+    Raises PolicyError, by name, for whatever ``load_policy`` would refuse later.
+    """
+    import onnx
+
+    path = Path(path)
+    _anonymise(model)
+    onnx.helper.set_model_props(model, {METADATA_KEY: contract.model_dump_json(), **_csv(contract)})
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as draft:
+        draft.write(seal(model))
+    try:
+        load_policy(draft.name, robot or load_robot(contract.robot))
+        os.chmod(draft.name, 0o644)
+        os.replace(draft.name, path)
+    finally:
+        Path(draft.name).unlink(missing_ok=True)
+    return load_policy(path, trial=0)
+
+
+def numbers(values: Any) -> Any:
+    """Nested lists of the shortest decimals that read back as the same float32 values."""
+    array = np.asarray(values, np.float32)
+    return [numbers(v) for v in array] if array.ndim else float(f"{array:.9g}")
+
+
+def golden(inputs: Mapping[str, np.ndarray], outputs: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """A golden sequence for ``Contract``; every array is (steps, ...), flattened row by row. Carries are left out."""
+    flat = [
+        {n: numbers(np.reshape(rows, (len(rows), -1))) for n, rows in side.items() if not n.startswith(CARRY)}
+        for side in (inputs, outputs)
+    ]
+    return {"steps": len(next(iter(inputs.values()))), "inputs": flat[0], "outputs": flat[1]}
+
+
+def envelope(batches: Iterable[Mapping[str, np.ndarray]]) -> dict[str, dict[str, list[float]]]:
+    """Statistics over ``batches`` of training inputs, each signal (rows, size): what ``Contract.envelope`` holds."""
+    seen: dict[str, list[np.ndarray]] = {}
+    for batch in batches:
+        for name, rows in batch.items():
+            if not name.startswith(CARRY):
+                seen.setdefault(name, []).append(np.reshape(np.asarray(rows, np.float64), (len(rows), -1)))
+    table = {name: np.concatenate(rows) for name, rows in seen.items()}
+    return {
+        name: {s: numbers(getattr(np, s)(rows, axis=0)) for s in ("min", "max", "mean", "std")}
+        for name, rows in table.items()
+    }
+
+
+def make_contract(fields: Mapping[str, Any], where: str) -> Contract:
+    """A checked Contract. Raises PolicyError naming each wrong field."""
+    try:
+        return Contract.model_validate(fields)
+    except ValidationError as error:
+        raise PolicyError(explain(where, error, Contract)) from None
+
+
+def export(
+    module: nn.Module,
+    path: str | Path,
+    *,
+    fields: Mapping[str, Any],
+    sequences: Sequence[Mapping[str, np.ndarray]],
+    carries: Mapping[str, np.ndarray] | None = None,
+) -> Policy:
+    """Export ``module`` to ``path`` and return the proved Policy.
+
+    ``fields``: the Contract's, less those that follow from the module: inputs, outputs, carry, golden.
+    ``sequences``: at least 3 recordings of realistic inputs, each signal (steps >= 20, *shape), better with skill
+    changes; what torch answers becomes the golden output. ``carries``: start value of each ``carry_*``, shape without
+    the batch axis. Raises PolicyError if the sequences are too few or the file would be refused.
+    """
+    import onnx
+    import torch
+
+    if len(sequences) < SEQUENCES or any(len(rows) < STEPS for s in sequences for rows in s.values()):
+        got = [len(next(iter(s.values()))) for s in sequences]
+        raise PolicyError(f"{path}: got golden sequences of {got} steps, expected at least {SEQUENCES} of {STEPS}")
+    carries = {n: np.asarray(v, np.float32) for n, v in (carries or {}).items()}
+    module = module.eval().cpu()
+    with torch.no_grad():
+        recorded = [(s, rollout(module, s, carries)) for s in sequences]
+    first, outputs = recorded[0]
+    inputs = {**{n: np.asarray(rows[0]) for n, rows in first.items()}, **carries}
+    contract = make_contract(
+        {
+            **fields,
+            "inputs": {n: list(v.shape) for n, v in inputs.items()},
+            "outputs": {n: list(rows.shape[1:]) for n, rows in outputs.items()},
+            "carry": {n: {"shape": list(v.shape), "start": numbers(v.ravel()) if v.any() else []} for n, v in carries.items()},
+            "golden": [golden(*pair) for pair in recorded],
+            "provenance": {
+                **fields["provenance"],
+                "tools": {"torch": torch.__version__.split("+")[0], "onnx": onnx.__version__, **fields["provenance"].get("tools", {})},
+            },
+        },
+        str(path),
+    )  # fmt: skip
+    return pack(_trace(module, inputs, list(outputs)), contract, path)
+
+
+def rollout(
+    module: nn.Module, sequence: Mapping[str, np.ndarray], carries: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """What ``module`` answers to one sequence from the start: every output, (steps, *shape)."""
+    import torch
+
+    state = {n: torch.tensor(v)[None] for n, v in carries.items()}
+    rows: dict[str, list[np.ndarray]] = {}
+    for t in range(len(next(iter(sequence.values())))):
+        signals = {n: torch.tensor(np.asarray(v[t], np.float32))[None] for n, v in sequence.items()}
+        outputs = module({**signals, **state})
+        state = {n: outputs[f"{n}_next"] for n in state}
+        for name, value in outputs.items():
+            rows.setdefault(name, []).append(value[0].numpy())
+    return {n: np.stack(r) for n, r in rows.items()}
+
+
+def _trace(module: nn.Module, inputs: Mapping[str, np.ndarray], outputs: list[str]) -> ModelProto:
+    """The module as ONNX, batch 1, tensors named as in the contract."""
+    import torch
+
+    class Named(torch.nn.Module):
+        """torch.onnx names tensors by position."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.module = module
+
+        def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+            answer = self.module(dict(zip(inputs, tensors, strict=True)))
+            return tuple(answer[n].clone() for n in outputs)  # a copy: an output that is an input has no name
+
+    program = torch.onnx.export(
+        Named(),
+        tuple(torch.tensor(np.asarray(v, np.float32))[None] for v in inputs.values()),
+        input_names=list(inputs),
+        output_names=outputs,
+        opset_version=OPSET,
+        dynamo=True,
+        external_data=False,
+        verbose=False,
+    )
+    assert program is not None
+    model = program.model_proto
+    model.ir_version = IR_VERSION
+    return model
+
+
+def _csv(contract: Contract) -> dict[str, str]:
+    """The keys that other stacks read, at full precision, in the order of the driven joints."""
+    default = dict(zip(contract.joint_names, contract.default_joint_pos, strict=True))
+    signals = [n for n in contract.inputs if not n.startswith(CARRY)]
+    rows: dict[str, Iterable[Any]] = {
+        "joint_names": contract.target_joint_names,
+        "joint_stiffness": contract.kp,
+        "joint_damping": contract.kd,
+        "default_joint_pos": [default.get(n, 0.0) for n in contract.target_joint_names],
+        "action_scale": contract.action_scale,
+        "observation_names": signals,
+        "command_names": [n for n in signals if n in ("command_velocity", "skill")],
+    }
+    return {key: ",".join(map(str, values)) for key, values in rows.items()}
+
+
+def _anonymise(model: ModelProto) -> None:
+    """Drop what exporters leave behind: source paths, stack traces, unused imports. They also change from run to run."""
+    model.doc_string = ""
+    model.producer_name, model.producer_version = "sim2real", ""
+    model.graph.doc_string = ""
+    del model.graph.metadata_props[:]
+    del model.graph.value_info[:]
+    for item in (*model.graph.node, *model.graph.input, *model.graph.output, *model.graph.initializer):
+        item.doc_string = ""
+        del item.metadata_props[:]
+    used = {n.domain for n in model.graph.node}
+    for entry in [e for e in model.opset_import if e.domain and e.domain not in used]:
+        model.opset_import.remove(entry)
