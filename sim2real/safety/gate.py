@@ -1,0 +1,144 @@
+"""Safety: the gate between whoever decides and the motors. Pure: no I/O, no clock, no logging, and it never raises."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sim2real.safety.evidence import Evidence
+from sim2real.safety.limits import KD, KP, POSITION, TORQUE, VELOCITY, Limiter, Limits
+from sim2real.safety.rules import RULES, Rule, When
+from sim2real.types import JointCommand, Mode, RobotState
+
+DISARMED = (When.ALWAYS,)
+WHILE_ARMED = (When.ALWAYS, When.COMMAND, When.ARMED)
+TO_ARM = (When.ALWAYS, When.ARM)
+
+
+class Fault(NamedTuple):
+    """A rule that was broken, and by what. ``over``: it is no longer."""
+
+    rule: Rule
+    joint: int  # index, -1: of no joint
+    value: float  # in ``rule.unit``
+    limit: float
+    time: float  # s
+    over: bool = False
+
+
+class Safety:
+    """The ladder RUN < HOLD < DAMP < OFF. It begins in OFF; ``arm`` is the only way down it, to RUN.
+
+    HOLD alone ends by itself, when its cause ends within ``hold_time``. Everything above it is latched.
+    """
+
+    def __init__(self, limits: Limits):
+        self.limits = limits
+        self.mode = Mode.OFF
+        self.fault: Fault | None = None  # the first cause of the mode; None: none, or the operator's stop
+        self.limited = 0  # joints whose command was changed in this step
+        self.events: tuple[Fault, ...] = ()  # faults that began or ended in this step, latched or not
+        self._evidence = Evidence(limits)
+        self._limiter = Limiter(limits)
+        self._values = np.empty((len(RULES), len(limits.joint_names)))
+        self._limits = np.empty_like(self._values)
+        for row, rule in zip(self._limits, RULES, strict=True):
+            row[:] = rule.limit(limits)
+        self._present: dict[int, Fault] = {}  # rule number -> what breaks it now
+        t = self._limiter.targets
+        self._command = JointCommand(-np.inf, t[POSITION], t[VELOCITY], t[TORQUE], t[KP], t[KD])
+
+    def arm(self, state: RobotState, now: float) -> str | None:
+        """Go to RUN from where the robot stands, or say what forbids it. While armed: nothing to do.
+
+        Commands that were decided before this are not obeyed: until one comes, kp is 0.
+        """
+        if self.mode <= Mode.HOLD:
+            return None
+        evidence = self._evidence
+        with np.errstate(all="ignore"):
+            evidence.see(state, now)
+            broken = self._broken()
+        for fault in broken:
+            cause = self.fault is not None and fault.rule is self.fault.rule and fault.rule.when is When.COMMAND
+            if cause or (fault.rule.when in TO_ARM and fault.rule.reaction > Mode.RUN):
+                return self.explain(fault, self.limits.joint_names)
+        self.mode, self.fault = Mode.RUN, None
+        evidence.armed_since, evidence.holding_since = evidence.now, np.inf
+        self._limiter.damp(evidence.joint_pos)
+        return None
+
+    def stop(self, now: float) -> None:
+        """The operator's stop: DAMP from the next step on. Never refused; OFF stays OFF."""
+        self.mode = max(self.mode, Mode.DAMP)
+
+    disarm = stop
+
+    def off(self) -> None:
+        """OFF until ``arm``."""
+        self.mode = Mode.OFF
+
+    def step(self, state: RobotState, command: JointCommand | None, now: float) -> JointCommand:
+        """What may be sent to the motors now. Returns the same object each call.
+
+        ``command`` is the newest there is, None: none yet. ``now`` in s. In RUN and HOLD the result is limited, in DAMP
+        it is kp = 0, kd = damping at the measured position, in OFF it is zero and not to be sent.
+        """
+        evidence, limiter = self._evidence, self._limiter
+        with np.errstate(all="ignore"):
+            evidence.see(state, now)
+            evidence.hear(command)
+            asked = WHILE_ARMED if self.mode <= Mode.HOLD else DISARMED
+            self._climb([fault for fault in self._broken() if fault.rule.when in asked])
+            self.limited = 0
+            if self.mode == Mode.OFF:
+                limiter.rest()
+            elif self.mode == Mode.DAMP:
+                limiter.damp(evidence.joint_pos)
+            else:
+                obey = self.mode == Mode.RUN and evidence.command_time >= evidence.armed_since
+                request = evidence.request if obey else limiter.targets.copy()
+                self.limited = limiter.limit(request, evidence.joint_pos, evidence.joint_vel, evidence.gap)
+        self._command.time = evidence.now
+        return self._command
+
+    def explain(self, fault: Fault, joint_names: Sequence[str]) -> str:
+        """A fault in words: what, where, got, expected, next step."""
+        rule = fault.rule
+        where = f"{joint_names[fault.joint]}: " if fault.joint >= 0 else ""
+        unit = f" {rule.unit}" if rule.unit else ""
+        return (
+            f"{rule.id} {rule.name}: {where}{rule.description}: "
+            f"got {fault.value:.4g}{unit}, expected at most {fault.limit:.4g}; {rule.remedy}"
+        )
+
+    def _broken(self) -> list[Fault]:
+        """Every rule that the evidence breaks, asked or not."""
+        evidence = self._evidence
+        for row, rule in zip(self._values, RULES, strict=True):
+            row[:] = rule.value(evidence)
+        kept = self._values <= self._limits
+        return [self._fault(i, kept[i]) for i, every in enumerate(kept.all(axis=1).tolist()) if not every]
+
+    def _fault(self, i: int, kept: np.ndarray) -> Fault:
+        rule, worst = RULES[i], int(kept.argmin())
+        joint = worst if np.ndim(rule.value(self._evidence)) else -1
+        return Fault(rule, joint, float(self._values[i, worst]), float(self._limits[i, worst]), self._evidence.now)
+
+    def _climb(self, faults: list[Fault]) -> None:
+        """Tell what began and ended, and take the ladder to the gravest reaction asked for."""
+        present = {fault.rule.number: fault for fault in faults}
+        began = [fault for number, fault in present.items() if number not in self._present]
+        ended = [fault._replace(over=True) for number, fault in self._present.items() if number not in present]
+        self._present, self.events = present, (*began, *ended)
+        if self.mode > Mode.HOLD:
+            return
+        gravest = max(faults, key=lambda fault: fault.rule.reaction, default=None)
+        mode = gravest.rule.reaction if gravest else Mode.RUN
+        if mode == Mode.RUN:
+            self.fault, self._evidence.holding_since = None, np.inf
+        elif self.mode == Mode.RUN:
+            self.fault, self._evidence.holding_since = gravest, self._evidence.now
+        self.mode = mode
