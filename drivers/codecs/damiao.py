@@ -22,7 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drivers.bus import BusError, BusSpec, MotorCommand, MotorSpec
+from drivers.bus import BusError, BusSpec, MotorCommand, MotorSpec, MotorState
+from drivers.can_bus import RegisterCheck
 from drivers.codecs.mit import MitCodec, Ranges, words_of
 from drivers.wire import make_frames
 
@@ -185,6 +186,142 @@ def _row_of(ids: np.ndarray) -> np.ndarray:
     table = np.full(0x801, -1, np.intp)
     table[ids] = np.arange(len(ids))
     return table
+
+
+class DamiaoCodec:
+    """The host's side of one bus: frames for its motors, and what their answers say (a ``can_bus.CanCodec``)."""
+
+    # Bits of one command and its answer on the wire, inter-frame space included: the mean of MIT traffic, and the most
+    # that bit stuffing makes of twice 8 bytes with an 11-bit identifier.
+    TICK_BITS = (117.6 + 115.0, 135.0 + 135.0)
+
+    def __init__(self, spec: BusSpec) -> None:
+        """Raises BusError for an unknown model, or identifiers by which the motors could not be told apart."""
+        _check_ids(spec)
+        n = len(spec.motors)
+        ranges = ranges_of(spec.motors)
+        self.mit = MitCodec(ranges)
+        self.checks = _checks(spec, ranges)
+        self._spec = spec
+        self._ids = np.array([m.id for m in spec.motors], np.uint32)
+        self._row_of = _row_of(np.array([m.feedback_id for m in spec.motors]))
+        refresh = np.array([pack_register(m.id, Operation.REFRESH) for m in spec.motors])
+        self._refresh = make_frames(np.full(n, BROADCAST_ID), refresh)
+        self._special = {
+            kind: make_frames(self._ids, np.tile(special_payload(kind), (n, 1)))
+            for kind in (Kind.CLEAR_ERROR, Kind.ENABLE, Kind.DISABLE)
+        }
+
+    def pack_command(self, command: MotorCommand) -> np.ndarray:
+        """One MIT command for each motor (FRAME, (n,)). Saturates; raises ValueError for a value not finite."""
+        c = command
+        return make_frames(self._ids, self.mit.pack_command(c.position, c.velocity, c.kp, c.kd, c.torque))
+
+    def pack_enable(self, state: MotorState) -> np.ndarray:
+        """Enable frames, each behind a "clear error" where ``state`` shows one: a motor with an error stays off."""
+        return np.concatenate([self._special[Kind.CLEAR_ERROR][state.error != 0], self._special[Kind.ENABLE]])
+
+    def pack_disable(self) -> np.ndarray:
+        return self._special[Kind.DISABLE]
+
+    def pack_poll(self, state: MotorState) -> np.ndarray:
+        """A request for feedback to each motor; to one that reports lost communication "clear error" instead, which it
+        answers alike: what it complains of is over once it is polled, and no other error is cleared without enabling.
+        """
+        lost = (state.error == LOST_COMMUNICATION)[:, None]
+        if not lost.any():
+            return self._refresh
+        return np.where(lost[:, 0], self._special[Kind.CLEAR_ERROR], self._refresh)
+
+    def pack_register(self, row: int, register: str, value: float | int | None = None) -> np.ndarray:
+        """One request (FRAME, (1,)) to read a register of motor ``row``, or to write ``value`` to it."""
+        operation, value = (Operation.READ, 0) if value is None else (Operation.WRITE, value)
+        data = pack_register(self._spec.motors[row].id, operation, register, value)
+        return make_frames(np.array([BROADCAST_ID]), data[None])
+
+    def unpack_registers(self, frames: np.ndarray) -> list[tuple[int, str, float | int]]:
+        """(row, register, value) of every answer on the register channel among ``frames``."""
+        rows, answers, _ = self._sort(frames)
+        found = zip(rows[answers].tolist(), frames["data"][answers], strict=True)
+        return [(row, r.register, r.value) for row, r in ((row, unpack_register(data)) for row, data in found)]
+
+    def unpack(self, frames: np.ndarray, state: MotorState, now: float) -> int:
+        """Put the feedback among ``frames`` into ``state``, the latest of each motor last. Returns how many frames came
+        from nobody on this bus or were malformed; answers on the register channel are neither."""
+        rows, answers, strangers = self._sort(frames)
+        data = frames["data"]
+        other = answers | strangers
+        if other.any():
+            rows, data = rows[~other], data[~other]
+        feedback = self.mit.unpack_feedback(data, rows)
+        status = feedback.byte0.astype(np.int64) >> 4
+        state.position[rows] = feedback.position
+        state.velocity[rows] = feedback.velocity
+        state.torque[rows] = feedback.torque
+        state.temperature[rows] = np.maximum(feedback.byte6, feedback.byte7)
+        state.enabled[rows] = status == 1
+        state.error[rows] = np.where(status > 1, status, 0)
+        state.time[rows] = now
+        return int(np.count_nonzero(strangers))
+
+    def _sort(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whose each frame is (m,), which are answers on the register channel (m,), and which nobody's (m,).
+
+        The identifier says whose; then the payload which kind. [id low, id high, 33 or 55, register] read as feedback
+        is a position within a thousandth of the negative end and a velocity below -36 % of full scale.
+        """
+        data = frames["data"]
+        rows = self._row_of[np.minimum(frames["id"], 0x800)]
+        ids = self._ids[rows]
+        answers = (
+            (data[:, 1] == ids >> 8) & (data[:, 0] == ids & 0xFF) & IS_ANSWER[data[:, 2]] & IS_REGISTER[data[:, 3]]
+        )
+        strangers = (rows < 0) | (data[:, 0] & 0xF != ids & 0xF) | (frames["length"] != 8)
+        return rows, answers & ~strangers, strangers
+
+    def error_name(self, code: int) -> str:
+        return ERRORS.get(code, f"unknown status {code:#x}") if code else "none"
+
+
+IS_ANSWER, IS_REGISTER = np.zeros((2, 256), bool)
+IS_ANSWER[[Operation.READ, Operation.WRITE]] = True
+IS_REGISTER[list(REGISTER_NAMES)] = True
+
+
+def _checks(spec: BusSpec, ranges: Ranges) -> list[RegisterCheck]:
+    """What connecting reads, writes and compares, in this order."""
+    fix = "put the motor's model into the wiring, or write the register back with the maker's tool"
+    ticks = np.full(len(spec.motors), timeout_ticks(spec.watchdog))
+    return [
+        RegisterCheck("PMAX", ranges.position, f"positions would be scaled wrongly: {fix}"),
+        RegisterCheck("VMAX", ranges.velocity, f"velocities would be scaled wrongly: {fix}"),
+        RegisterCheck("TMAX", ranges.torque, f"torques would be scaled wrongly: {fix}"),
+        RegisterCheck(
+            "CTRL_MODE", np.full(len(ticks), MIT_MODE), "set it to 1 (MIT) with the maker's tool and store it"
+        ),
+        RegisterCheck("TIMEOUT", ticks, "the motor would not stop by itself: update its firmware", write=True),
+    ]
+
+
+def _check_ids(spec: BusSpec) -> None:
+    taken: dict[int, str] = {}  # identifiers on which a motor listens, in any CTRL_MODE
+    for m in spec.motors:
+        if not 0 < m.id < MODE_STRIDE:
+            raise BusError(f"bus {spec.name}, motor of {m.joint}: got id {m.id:#x}, expected 0x1 to 0xff (ESC_ID)")
+        taken |= {m.id + mode * MODE_STRIDE: m.joint for mode in range(4)}
+    answered: dict[int, str] = {}
+    for m in spec.motors:
+        where = f"bus {spec.name}, motor of {m.joint} (id {m.id:#x}): got feedback_id {m.feedback_id:#x}"
+        fix = f"write its MST_ID, by convention id + 0x10 = {m.id + 0x10:#x}, and put it into the wiring"
+        if not 0 < m.feedback_id < BROADCAST_ID:
+            raise BusError(f"{where}, expected 0x1 to 0x7fe: {fix}")
+        if m.feedback_id in answered:
+            other = answered[m.feedback_id]
+            raise BusError(f"{where}, which the motor of {other} has too; feedback holds 4 bits of the id: {fix}")
+        if m.feedback_id in taken:
+            listener = taken[m.feedback_id]
+            raise BusError(f"{where}, on which the motor of {listener} listens for commands: {fix}")
+        answered[m.feedback_id] = m.joint
 
 
 class DamiaoMotors:

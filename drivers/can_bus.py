@@ -1,0 +1,225 @@
+"""MotorBus over a CAN wire. What the frames mean is the codec's; here are the connecting, the counting and the clock.
+
+A protocol is added by one codec file with a class like CanCodec, and one line in ``drivers/open.py``.
+
+When the transmit queue is full (ENOBUFS: nobody acknowledges, or the bus is overloaded) the rest of the tick is dropped,
+never queued for later; after QUEUE_FULL_TIME of it every write raises BusError. What the kernel already holds cannot be
+taken back: at most ``txqueuelen`` (default 10) frames go out when the bus comes back. They are commands, never an
+"enable", and by then the watchdog programmed while connecting has disabled the motors, which ignore them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, NoReturn, Protocol
+
+import numpy as np
+
+from drivers.bus import BusCounters, BusError, BusSpec, Clock, MotorCommand, MotorState
+from drivers.wire import ERROR, CanWire, WireError, WireFull
+
+TRIES = 3  # of a request while connecting
+ANSWER_TIME = 0.04  # s to wait for the answers to one try
+POLL_PERIOD = 0.001  # s between two looks at the wire while waiting
+QUEUE_FULL_TIME = 1.0  # s with no tick going out whole, then the bus is dead
+REGISTER_TOLERANCE = 1e-4  # relative, of a float register
+
+
+class RegisterCheck(NamedTuple):
+    """A register that must hold ``expected`` (n,) on every motor before torque; ``write`` it first, then read it back."""
+
+    register: str
+    expected: np.ndarray
+    consequence: str  # of another value, and what to do: ends the error message
+    write: bool = False
+
+
+class CanCodec(Protocol):
+    """One protocol on CAN, for the n motors of one bus. Pure: frames in and out, no wire, no clock."""
+
+    TICK_BITS: tuple[float, float]  # bits of a motor's command and answer on the wire: typical, worst
+    checks: list[RegisterCheck]
+
+    def pack_command(self, command: MotorCommand) -> np.ndarray: ...
+
+    def pack_enable(self, state: MotorState) -> np.ndarray: ...
+
+    def pack_disable(self) -> np.ndarray: ...
+
+    def pack_poll(self, state: MotorState) -> np.ndarray: ...
+
+    def pack_register(self, row: int, register: str, value: float | int | None = None) -> np.ndarray: ...
+
+    def unpack_registers(self, frames: np.ndarray) -> list[tuple[int, str, float | int]]: ...
+
+    def unpack(self, frames: np.ndarray, state: MotorState, now: float) -> int: ...
+
+    def error_name(self, code: int) -> str: ...
+
+
+class CanBus:
+    """The motors of one CAN bus (a ``drivers.bus.MotorBus``)."""
+
+    def __init__(self, spec: BusSpec, codec: CanCodec, wire: CanWire) -> None:
+        self.spec = spec
+        self.counters = BusCounters(extra={"bus_errors": 0, "disable_failed": 0})
+        self._codec = codec
+        self._wire = wire
+        self._clock: Clock | None = None
+        self._state = MotorState.empty(len(spec.motors))
+        self._heard: set[int] = set()  # identifiers of the frames that arrived while connecting
+        self._whole = 0.0  # s, when a tick last went out whole
+
+    def connect(self, clock: Clock) -> None:
+        """Disable every motor, compare its registers with the wiring, program the watchdog and hear its state.
+
+        Takes up to TRIES * ANSWER_TIME for each register, all motors at once. Raises BusError naming every motor that
+        does not answer, or that answers something else.
+        """
+        self._clock = clock
+        self._whole = clock.now()
+        self._receive()  # what others left there
+        self._transmit(self._codec.pack_disable(), required=True)
+        for check in self._codec.checks:
+            self._check(check, clock)
+        self._hear_all(clock)
+
+    def poll(self) -> None:
+        self._transmit(self._codec.pack_poll(self._state))
+
+    def enable(self) -> None:
+        """Raises BusError if not every frame went out: some motors may be enabled then, so disable."""
+        self._transmit(self._codec.pack_enable(self._state), required=True)
+
+    def disable(self) -> None:
+        try:
+            self._wire.send(self._codec.pack_disable())
+            self.counters.sent += len(self.spec.motors)
+        except Exception:  # the stop path goes on: the other buses, and the motors' own watchdogs
+            self.counters.extra["disable_failed"] += 1
+
+    def write(self, command: MotorCommand) -> None:
+        self._transmit(self._codec.pack_command(command))
+
+    def read(self, now: float) -> MotorState:
+        frames = self._receive()
+        if len(frames):
+            self.counters.received += len(frames)
+            self.counters.rejected += self._codec.unpack(frames, self._state, now)
+        return self._state
+
+    def error_name(self, code: int) -> str:
+        return self._codec.error_name(code)
+
+    def close(self) -> None:
+        self._wire.close()
+
+    def _transmit(self, frames: np.ndarray, required: bool = False) -> None:
+        """Send one tick. ``required``: a full queue is an error at once, and not only after QUEUE_FULL_TIME."""
+        if self._clock is None:
+            raise BusError(f"bus {self.spec.name}: not connected; call connect(clock) first")
+        try:
+            self._wire.send(frames)
+        except WireFull as error:
+            self.counters.lost += 1
+            if required or self._clock.now() - self._whole >= QUEUE_FULL_TIME:
+                raise BusError(
+                    f"bus {self.spec.name} ({self._where()}): the transmit queue is full; got no acknowledgement, "
+                    f"expected frames to leave within {0 if required else QUEUE_FULL_TIME:g} s.\n"
+                    "  Check motor power, wiring, termination and bit rate; `ip -s link` shows bus-off; "
+                    f"then connect again ({error})"
+                ) from error
+        except WireError as error:
+            raise BusError(f"bus {self.spec.name} ({self._where()}): {error}") from error
+        else:
+            self.counters.sent += len(frames)
+            self._whole = self._clock.now()
+
+    def _receive(self) -> np.ndarray:
+        try:
+            frames = self._wire.recv()
+        except WireError as error:
+            raise BusError(f"bus {self.spec.name} ({self._where()}): {error}") from error
+        error = frames["id"] & ERROR != 0
+        if error.any():
+            self.counters.extra["bus_errors"] += int(np.count_nonzero(error))
+            frames = frames[~error]
+        return frames
+
+    def _check(self, check: RegisterCheck, clock: Clock) -> None:
+        """Write (if it is to be written) and read back one register of every motor, and compare."""
+        for value in [check.expected, None] if check.write else [None]:
+            got = self._ask(check.register, value, clock)
+        wrong = [
+            f"bus {self.spec.name}, motor of {m.joint} (id {m.id:#x}, {m.model}): register {check.register} is "
+            f"{got[row]:g}, expected {expected:g}"
+            for row, (m, expected) in enumerate(zip(self.spec.motors, check.expected.tolist(), strict=True))
+            if not abs(got[row] - expected) <= REGISTER_TOLERANCE * abs(expected)
+        ]
+        if wrong:
+            raise BusError("\n".join(wrong) + f"\n  {check.consequence}")
+
+    def _ask(self, register: str, value: np.ndarray | None, clock: Clock) -> dict[int, float | int]:
+        """The answers {row: value} of all motors to reading ``register``, or to writing ``value`` (n,) to it."""
+        answers: dict[int, float | int] = {}
+        motors = range(len(self.spec.motors))
+
+        def request() -> np.ndarray:
+            missing = [row for row in motors if row not in answers]
+            asked = [self._codec.pack_register(row, register, None if value is None else value[row]) for row in missing]
+            return np.concatenate(asked)
+
+        def take(frames: np.ndarray) -> bool:
+            answers.update((row, v) for row, r, v in self._codec.unpack_registers(frames) if r == register)
+            return len(answers) == len(motors)
+
+        if not self._converse(request, take, clock):
+            self._refuse_silence([row for row in motors if row not in answers], f"a request for register {register}")
+        return answers
+
+    def _hear_all(self, clock: Clock) -> None:
+        """Take in a state of every motor from after it was disabled, and make sure that it is."""
+        asked = clock.now()
+        self._state.time[:] = -np.inf
+
+        def take(frames: np.ndarray) -> bool:
+            self.counters.rejected += self._codec.unpack(frames, self._state, clock.now())
+            return bool((self._state.time >= asked).all())
+
+        if not self._converse(lambda: self._codec.pack_poll(self._state), take, clock):
+            self._refuse_silence(np.flatnonzero(self._state.time < asked).tolist(), "a request for its state")
+        for row in np.flatnonzero(self._state.enabled):
+            m = self.spec.motors[row]
+            raise BusError(
+                f"bus {self.spec.name}, motor of {m.joint} (id {m.id:#x}): enabled, expected disabled while connecting."
+                "\n  Does another program command it? Stop that, and connect again"
+            )
+
+    def _converse(self, request: Callable[[], np.ndarray], take: Callable[[np.ndarray], bool], clock: Clock) -> bool:
+        """Send what ``request`` makes and give ``take`` what arrives until it is content, up to TRIES times."""
+        for _ in range(TRIES):
+            self._transmit(request(), required=True)
+            end = clock.now() + ANSWER_TIME
+            while clock.now() < end:
+                clock.sleep_until(clock.now() + POLL_PERIOD)
+                frames = self._receive()
+                self.counters.received += len(frames)
+                self._heard.update(frames["id"].tolist())
+                if take(frames):
+                    return True
+        return False
+
+    def _refuse_silence(self, rows: list[int], question: str) -> NoReturn:
+        """Raise BusError for motors that did not answer."""
+        strangers = self._heard - {m.feedback_id for m in self.spec.motors}
+        heard = ", ".join(f"{i:#x}" for i in sorted(strangers)) or "none"
+        lines = [
+            f"bus {self.spec.name}, motor of {m.joint} (id {m.id:#x}): no answer on {m.feedback_id:#x} to {question}, "
+            f"tried {TRIES} times for {ANSWER_TIME * 1e3:g} ms"
+            for m in (self.spec.motors[row] for row in rows)
+        ]
+        hint = f"Frames from other identifiers: {heard}. Check power, connector, id and feedback_id, and the bit rate"
+        raise BusError("\n".join(lines) + f"\n  {self._where()}: {hint} ({self.spec.bitrate} bit/s)")
+
+    def _where(self) -> str:
+        return f"{self.spec.interface} {self.spec.channel}".strip()
