@@ -6,17 +6,22 @@ old. The one call that moves the robot is in ``Guardian._transmit``.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from drivers.budget import typical_frame_bits
 
+from drivers.budget import typical_frame_bits
+from drivers.bus import BusError
+from drivers.wire import WireError
 from sim2real.channel import Channel
 from sim2real.clock import MonotonicClock, SimClock
 from sim2real.records import Calls, Layout, command_fields, command_view, layout, state_view, tick_layout
-from sim2real.robot import Robot
-from sim2real.safety import Safety
+from sim2real.robot import Robot, open_robot
+from sim2real.run import Life, RunSpec, channel, keep_time, sink, tell
+from sim2real.safety import Limits, Safety
 from sim2real.types import JointCommand, Mode
 
 TICK, PILOT = 0, 1  # topics of a record

@@ -106,7 +106,7 @@ def main(directory: Path) -> int:
     life = Life()
     spec = RunSpec.load(directory)
     config, wiring = spec.open()
-    player = SkillPlayer(config, [load_policy(Path(p), config, isolate=False) for p in spec.policies])
+    player = SkillPlayer(config, [load_policy(Path(p), config, trial=0) for p in spec.policies])
     joints = config.joint_names
     pilot = Pilot(
         player,
