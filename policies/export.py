@@ -1,23 +1,22 @@
 """Export: from a torch module to one policy file under the contract, with golden sequences inside.
 
-A module is exported as it trains: called with a dict of named tensors (batch, *shape), it returns a dict of named tensors
-(see ``sim2real.contract.INPUTS`` and ``OUTPUTS``; a carry ``carry_x`` goes in, ``carry_x_next`` comes out)::
+A module is exported as it trains. It says what its tensors are called and takes and returns them in that order, each
+with a batch axis of 1 (see ``Exportable``; the vocabulary is ``sim2real.contract.INPUTS`` and ``OUTPUTS``)::
 
-    class Basics(torch.nn.Module):
-        def forward(self, inputs: dict[str, Tensor]) -> dict[str, Tensor]: ...
-
-    export(Basics(), "basics.onnx", fields=dict(name="basics", robot="g1", ...), sequences=[...])
+    export(module, "basics.onnx", fields=dict(name="basics", robot="g1", ...), sequences=[...])
 
 Same module, fields and sequences: same bytes. ``pack`` is the half that needs no torch; ``policies.adopt`` uses it too.
 """
 
 from __future__ import annotations
 
+import logging
+import math
 import os
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from pydantic import ValidationError
@@ -29,7 +28,6 @@ from sim2real.policy import Policy, PolicyError, load_policy
 
 if TYPE_CHECKING:
     from onnx import ModelProto
-    from torch import Tensor, nn
 
 OPSET = 18
 IR_VERSION = 10
@@ -95,87 +93,90 @@ def make_contract(fields: Mapping[str, Any], where: str) -> Contract:
         raise PolicyError(explain(where, error, Contract)) from None
 
 
+class Exportable(Protocol):
+    """A ``torch.nn.Module`` whose ``forward`` takes the tensors of ``inputs()`` and returns those of ``outputs()``."""
+
+    def inputs(self) -> dict[str, list[int]]:
+        """Every input by name, carries included, with its shape without the batch axis."""
+        ...
+
+    def outputs(self) -> dict[str, list[int]]:
+        """Every output by name, ``carry_*_next`` included. None may be an input itself: add zero instead."""
+        ...
+
+    def carry_start(self) -> dict[str, list[float]]:
+        """What each carry starts from, flat; an empty list is zeros."""
+        ...
+
+
 def export(
-    module: nn.Module,
+    module: Exportable,
     path: str | Path,
     *,
     fields: Mapping[str, Any],
     sequences: Sequence[Mapping[str, np.ndarray]],
-    carries: Mapping[str, np.ndarray] | None = None,
 ) -> Policy:
     """Export ``module`` to ``path`` and return the proved Policy.
 
     ``fields``: the Contract's, less those that follow from the module: inputs, outputs, carry, golden.
     ``sequences``: at least 3 recordings of realistic inputs, each signal (steps >= 20, *shape), better with skill
-    changes; what torch answers becomes the golden output. ``carries``: start value of each ``carry_*``, shape without
-    the batch axis. Raises PolicyError if the sequences are too few or the file would be refused.
+    changes; what torch answers becomes the golden output. Raises PolicyError if the sequences are too few or the file
+    would be refused.
     """
     import onnx
     import torch
 
-    if len(sequences) < SEQUENCES or any(len(rows) < STEPS for s in sequences for rows in s.values()):
-        got = [len(next(iter(s.values()))) for s in sequences]
-        raise PolicyError(f"{path}: got golden sequences of {got} steps, expected at least {SEQUENCES} of {STEPS}")
-    carries = {n: np.asarray(v, np.float32) for n, v in (carries or {}).items()}
-    module = module.eval().cpu()
-    with torch.no_grad():
-        recorded = [(s, rollout(module, s, carries)) for s in sequences]
-    first, outputs = recorded[0]
-    inputs = {**{n: np.asarray(rows[0]) for n, rows in first.items()}, **carries}
+    lengths = [len(next(iter(s.values()))) for s in sequences]
+    if len(sequences) < SEQUENCES or min(lengths) < STEPS:
+        raise PolicyError(f"{path}: got golden sequences of {lengths} steps, expected at least {SEQUENCES} of {STEPS}")
+    carry = {n: {"shape": module.inputs()[n], "start": numbers(v)} for n, v in module.carry_start().items()}
+    recorded = [golden(s, rollout(module, s)) for s in sequences]
+    tools = {"torch": torch.__version__.split("+")[0], "onnx": onnx.__version__}
     contract = make_contract(
         {
             **fields,
-            "inputs": {n: list(v.shape) for n, v in inputs.items()},
-            "outputs": {n: list(rows.shape[1:]) for n, rows in outputs.items()},
-            "carry": {n: {"shape": list(v.shape), "start": numbers(v.ravel()) if v.any() else []} for n, v in carries.items()},
-            "golden": [golden(*pair) for pair in recorded],
-            "provenance": {
-                **fields["provenance"],
-                "tools": {"torch": torch.__version__.split("+")[0], "onnx": onnx.__version__, **fields["provenance"].get("tools", {})},
-            },
+            "inputs": module.inputs(),
+            "outputs": module.outputs(),
+            "carry": carry,
+            "golden": recorded,
+            "provenance": {**fields["provenance"], "tools": {**tools, **fields["provenance"].get("tools", {})}},
         },
         str(path),
-    )  # fmt: skip
-    return pack(_trace(module, inputs, list(outputs)), contract, path)
+    )
+    return pack(_trace(module), contract, path)
 
 
-def rollout(
-    module: nn.Module, sequence: Mapping[str, np.ndarray], carries: Mapping[str, np.ndarray]
-) -> dict[str, np.ndarray]:
-    """What ``module`` answers to one sequence from the start: every output, (steps, *shape)."""
+def rollout(module: Exportable, sequence: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What ``module`` answers to one sequence of signals from the start: every output, (steps, *shape)."""
     import torch
 
-    state = {n: torch.tensor(v)[None] for n, v in carries.items()}
-    rows: dict[str, list[np.ndarray]] = {}
-    for t in range(len(next(iter(sequence.values())))):
-        signals = {n: torch.tensor(np.asarray(v[t], np.float32))[None] for n, v in sequence.items()}
-        outputs = module({**signals, **state})
-        state = {n: outputs[f"{n}_next"] for n in state}
-        for name, value in outputs.items():
-            rows.setdefault(name, []).append(value[0].numpy())
+    assert isinstance(module, torch.nn.Module)
+    module = module.eval().cpu()
+    shapes, starts = module.inputs(), module.carry_start()
+    carry = {n: torch.tensor(v or 0.0).expand(math.prod(shapes[n])).reshape(1, *shapes[n]) for n, v in starts.items()}
+    rows: dict[str, list[np.ndarray]] = {n: [] for n in module.outputs()}
+    with torch.no_grad():
+        for t in range(len(next(iter(sequence.values())))):
+            signals = {n: torch.tensor(np.asarray(v[t], np.float32))[None] for n, v in sequence.items()}
+            answer = module(*({**signals, **carry}[n] for n in shapes))
+            outputs = dict(zip(rows, answer, strict=True))
+            carry = {n: outputs[f"{n}_next"] for n in carry}
+            for name, value in outputs.items():
+                rows[name].append(value[0].numpy().copy())
     return {n: np.stack(r) for n, r in rows.items()}
 
 
-def _trace(module: nn.Module, inputs: Mapping[str, np.ndarray], outputs: list[str]) -> ModelProto:
+def _trace(module: Exportable) -> ModelProto:
     """The module as ONNX, batch 1, tensors named as in the contract."""
     import torch
 
-    class Named(torch.nn.Module):
-        """torch.onnx names tensors by position."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.module = module
-
-        def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-            answer = self.module(dict(zip(inputs, tensors, strict=True)))
-            return tuple(answer[n].clone() for n in outputs)  # a copy: an output that is an input has no name
-
+    assert isinstance(module, torch.nn.Module)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nobody asked for
     program = torch.onnx.export(
-        Named(),
-        tuple(torch.tensor(np.asarray(v, np.float32))[None] for v in inputs.values()),
-        input_names=list(inputs),
-        output_names=outputs,
+        module.eval().cpu(),
+        tuple(torch.zeros(1, *shape) for shape in module.inputs().values()),
+        input_names=list(module.inputs()),
+        output_names=list(module.outputs()),
         opset_version=OPSET,
         dynamo=True,
         external_data=False,
