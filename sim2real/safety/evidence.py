@@ -32,6 +32,7 @@ class Evidence:
         self.measured, self.joint_vel, self.temperature, self.error, self.enabled, self.joint_age = self._joints
         self.joint_pos = np.zeros(n)  # rad, the last measured that was no jump
         self.jump_ticks = np.zeros(n)  # ticks in a row in which ``measured`` had jumped away from ``joint_pos``
+        self._fastest = limits.velocity * limits.jump_ratio  # rad/s
         self._sampled = np.full(n, -math.inf)  # s, when ``joint_pos`` was received
         self.enabled_at = np.full(n, -math.inf)  # s, when each motor last said that it is enabled
         self.imu = np.full(10, np.nan)
@@ -70,14 +71,12 @@ class Evidence:
             _fill(self.request, (command.joint_pos, command.joint_vel, command.joint_torque, command.kp, command.kd))
 
     def _track_jumps(self, now: float) -> None:
-        sampled = now - self.joint_age
-        fastest = self.limits.velocity * self.limits.jump_ratio
-        reach = np.minimum(fastest * (now - self._sampled), FINITE)
+        reach = np.minimum(self._fastest * (now - self._sampled), FINITE)
         real = np.abs(self.measured - self.joint_pos) <= reach
         self.jump_ticks += 1
-        self.jump_ticks[real] = 0
+        np.copyto(self.jump_ticks, 0, where=real)
         np.copyto(self.joint_pos, self.measured, where=real)
-        np.copyto(self._sampled, sampled, where=real)
+        np.subtract(now, self.joint_age, out=self._sampled, where=real)
 
     def _track_gyro(self, sampled: float) -> None:
         if sampled - self._imu_sampled > SAME_SAMPLE:

