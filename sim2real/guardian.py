@@ -95,7 +95,7 @@ class Guardian:
         """One turn of the loop. Never raises for anything that a bus, a policy or an operator does."""
         clock, state = self.clock, self._state
         start = clock.now()
-        self.robot.read(start, state)
+        self._guard(lambda: self.robot.read(start, state))
         read = clock.now()
         calls = self._obey_operator(start)
         command = self.safety.step(state, self._request(), start)

@@ -5,13 +5,13 @@ Real and simulated robots are this same class; only the wires under the buses di
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from drivers.open import open_bus, open_imu
 
-from drivers.bus import Clock, Imu, MotorBus, MotorCommand
+from drivers.bus import Clock, Imu, ImuState, MotorBus, MotorCommand, MotorState
 from sim2real.config import RobotConfig, Wiring
 from sim2real.types import JointCommand, RobotState
 
@@ -37,6 +37,8 @@ class Robot:
             MotorCommand(*(self._command[row, start:stop] for row in range(5)))
             for start, stop in zip(stops[:-1], stops[1:], strict=True)
         ]
+        self._states = [MotorState.empty(len(bus.spec.motors)) for bus in self.buses]
+        self._imu_state = ImuState.empty()
         mount = np.array(imu.spec.orientation_imu_in_base, float)
         self._mount = mount / np.linalg.norm(mount)
         self._mounted_straight = bool(np.allclose(np.abs(self._mount), (1, 0, 0, 0)))
@@ -48,8 +50,12 @@ class Robot:
             bus.connect(clock)
 
     def read(self, now: float, state: RobotState) -> None:
-        """Take in everything that arrived and fill ``state`` in place."""
-        states = [bus.read(now) for bus in self.buses]
+        """Take in everything that arrived and fill ``state`` in place.
+
+        A bus that cannot be read keeps its last state, whose ages grow; the first such BusError is raised at the end.
+        """
+        states = self._states
+        failure = self._each(lambda bus, i: states.__setitem__(i, bus.read(now)))
         order = self._motor_of_joint
         state.time = now
         np.subtract(np.concatenate([s.position for s in states])[order], self._offset, out=state.joint_pos)
@@ -60,7 +66,10 @@ class Robot:
         state.joint_error[:] = np.concatenate([s.error for s in states])[order]
         state.joint_enabled[:] = np.concatenate([s.enabled for s in states])[order]
         np.subtract(now, np.concatenate([s.time for s in states])[order], out=state.joint_age)
-        imu = self.imu.read(now)
+        try:
+            imu = self._imu_state = self.imu.read(now)
+        except Exception as error:  # noqa: BLE001 - raised below
+            imu, failure = self._imu_state, failure or error
         if self._mounted_straight:
             state.orientation_base_in_world[:] = imu.orientation_imu_in_world
             state.angular_velocity_base_in_base[:] = imu.angular_velocity_imu_in_imu
@@ -70,6 +79,8 @@ class Robot:
             state.angular_velocity_base_in_base[:] = self._mount_matrix @ imu.angular_velocity_imu_in_imu
             state.acceleration_base_in_base[:] = self._mount_matrix @ imu.acceleration_imu_in_imu
         state.imu_age = now - imu.time
+        if failure is not None:
+            raise failure
 
     def write(self, command: JointCommand) -> None:
         """Send one tick of joint targets. Raises BusError when a wire is gone (the other buses are still written)."""
@@ -81,14 +92,14 @@ class Robot:
         c[2] = command.kp[of]
         c[3] = command.kd[of]
         np.multiply(command.joint_torque[of], sign, out=c[4])
-        self._each(lambda bus, i: bus.write(self._commands[i]))
+        self._act(lambda bus, i: bus.write(self._commands[i]))
 
     def poll(self) -> None:
         """Ask every motor for its state, commanding nothing."""
-        self._each(lambda bus, i: bus.poll())
+        self._act(lambda bus, i: bus.poll())
 
     def enable(self) -> None:
-        self._each(lambda bus, i: bus.enable())
+        self._act(lambda bus, i: bus.enable())
 
     def disable(self) -> None:
         """Take torque off every motor. Never raises."""
@@ -109,16 +120,19 @@ class Robot:
             bus.close()
         self.imu.close()
 
-    def _each(self, act) -> None:
-        """Do it on every bus even if one fails, then raise the first failure: one dead bus must not silence four."""
+    def _act(self, act: Callable[[MotorBus, int], None]) -> None:
+        if (failure := self._each(act)) is not None:
+            raise failure
+
+    def _each(self, act: Callable[[MotorBus, int], None]) -> Exception | None:
+        """Do it on every bus even if one fails, for one dead bus must not silence four. Returns the first failure."""
         first: Exception | None = None
         for i, bus in enumerate(self.buses):
             try:
                 act(bus, i)
-            except Exception as error:  # noqa: BLE001 - re-raised below
+            except Exception as error:  # noqa: BLE001 - returned
                 first = first or error
-        if first is not None:
-            raise first
+        return first
 
 
 def open_robot(

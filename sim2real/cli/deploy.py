@@ -194,7 +194,7 @@ def _lockstep(args, config, player, policies, paths, operator, record, console):
 
     camera = None
     if args.video:
-        from sim2real.video import Camera
+        from drivers.sim.camera import Camera
 
         camera = Camera(args.video)
     simulation = Simulation(
@@ -204,7 +204,7 @@ def _lockstep(args, config, player, policies, paths, operator, record, console):
         Scene(seed=args.seed, faults=parse_faults(args.fault)),
         args.wiring,
         sink_for if record else None,
-        camera,
+        (lambda run: camera.see(run.world.plant)) if camera else None,
         tell=lambda text: console.print(f"  {text}", style="yellow"),
     )
     summary = simulation.run()
