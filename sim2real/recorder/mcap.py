@@ -6,6 +6,7 @@ clock appears in the metadata only. A file is written as ``<name>.part`` and ren
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -69,6 +70,7 @@ class Writer:
         self._mcap.add_metadata(RUN, run)
         for name, content in attachments.items():
             self._mcap.add_attachment(0, 0, name, "application/octet-stream", content)
+        self._mcap.flush()  # whatever happens to the run, its file says what it was
         self._channels = [
             self._mcap.register_channel(
                 topic, "cdr", self._mcap.register_schema(f"{PACKAGE}/msg/{layout.name}", "ros2msg", schemas[topic])
@@ -127,10 +129,12 @@ class Writer:
         try:
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             if self.path.exists():
-                raise FileExistsError(None, "is there already, and no record is overwritten")
+                raise FileExistsError(errno.EEXIST, "is there already, and no record is overwritten", str(self.path))
             return os.fdopen(os.open(self.part, flags, 0o600), "wb")
         except OSError as error:
-            raise Sim2realError(f"{self.path}: cannot record: {error.strerror}; name another file") from None
+            raise Sim2realError(
+                f"{self.path}: cannot record: {error.strerror}: {error.filename}; name another file"
+            ) from None
 
     def _reserve(self, size: int) -> bool:
         """Allocate disk for ``size`` bytes more and for the end of the file. False: there is none, recording stops."""

@@ -58,15 +58,15 @@ class Reader:
                     f"{self.path}: not a record: got a file that starts with {bytes(data[:8])!r}, expected MCAP;"
                     " give a file that sim2real deploy wrote"
                 )
-            self.size = len(data)
             self._walk(data)
+            self._finished &= data[-len(MAGIC) :] == MAGIC
+        if not self._finished and not self.damage:
+            self.damage.append("the end is missing")
         if not self.layouts and not self.damage:
             raise Sim2realError(
                 f"{self.path}: an MCAP file, but not a record of a run: no '{LAYOUTS}' in it;"
                 " give a file that sim2real deploy wrote"
             )
-        if not self._finished and not self.damage:
-            self.damage.append("the end is missing")
         if self.damage and not salvage:
             raise Sim2realError(
                 f"{self.path}: damaged: {self.damage[0]}; save what is there with: sim2real log repair {self.path}"

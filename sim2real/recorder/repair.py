@@ -40,6 +40,9 @@ def repair(source: Path | str, output: Path | str | None = None) -> Repair:
     arrays = [reader[name] for name in reader.topics]
     for time, topic, i in order:
         writer.write(topic, time / 1e9, arrays[topic][i].tobytes())
+    if writer.stopped:
+        writer.finish()
+        raise Sim2realError(f"{writer.stopped}; the repair is incomplete: free some space, or name another file")
     writer.finish({**reader.ending, "damage": reader.damage})
     return Repair(
         source,

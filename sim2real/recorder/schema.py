@@ -30,12 +30,11 @@ def ros2msg(record: Layout) -> str:
     last = ""
     for field in record.dtype.names or ():
         *parents, leaf = field.split(".")
-        node = tree
+        node, path = tree, ""
         for parent in parents:
-            if parent in node and not last.startswith(field[: field.index(parent) + len(parent)] + "."):
-                raise Sim2realError(
-                    f"layout {record.name}: field '{field}' is apart from the other '{parent}.*' fields"
-                )
+            path += parent + "."
+            if parent in node and not last.startswith(path):
+                raise Sim2realError(f"layout {record.name}: field '{field}' is apart from the other '{path}*' fields")
             node = node.setdefault(parent, {})
         base = record.dtype[field].base.str
         elements = record.elements.get(field)
