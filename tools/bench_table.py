@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import gc
+import json
+import os
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from time import perf_counter
@@ -10,6 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rich.table import Table
+
+from sim2real.types import Sim2realError
 
 ROOT = Path(__file__).resolve().parents[1]
 QUANTILES = (50, 99, 99.9)  # per cent
@@ -60,6 +67,24 @@ def quantiles(seconds: np.ndarray) -> list[float]:
 def slashed(numbers: Iterable[float], form: str = ".0f") -> str:
     """``36 / 84 / 203``."""
     return " / ".join(format(n, form) for n in numbers)
+
+
+def sim2real(*argv: object) -> subprocess.CompletedProcess[str]:
+    """Run the program as a user would. Raises Sim2realError with its last words where it refuses or breaks."""
+    program = "import sys; from sim2real.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", program, *map(str, argv)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, env={**os.environ, "NO_COLOR": "1"})
+    if done.returncode not in (0, 1) or "Traceback" in done.stderr:
+        raise Sim2realError(f"sim2real {argv[0]}: {' '.join((done.stderr or done.stdout).split())[-400:]}")
+    return done
+
+
+def deploy(*argv: object) -> dict[str, Any]:
+    """Run ``sim2real deploy --robot g1`` and return its summary."""
+    with tempfile.TemporaryDirectory() as directory:
+        summary = Path(directory) / "summary.json"
+        sim2real("deploy", "--robot", "g1", "--json", summary, *argv)
+        return json.loads(summary.read_text())
 
 
 def table(rows: list[Row], title: str) -> Table:
