@@ -34,6 +34,15 @@ class RegisterCheck(NamedTuple):
     write: bool = False
 
 
+class RegisterAnswer(NamedTuple):
+    """What a motor says of one of its registers."""
+
+    row: int  # which motor of the bus
+    register: str
+    value: float | int
+    written: bool  # the answer to a write, not to a read
+
+
 class CanCodec(Protocol):
     """One protocol on CAN, for the n motors of one bus. Pure: frames in and out, no wire, no clock."""
 
@@ -50,7 +59,7 @@ class CanCodec(Protocol):
 
     def pack_register(self, row: int, register: str, value: float | int | None = None) -> np.ndarray: ...
 
-    def unpack_registers(self, frames: np.ndarray) -> list[tuple[int, str, float | int]]: ...
+    def unpack_registers(self, frames: np.ndarray) -> list[RegisterAnswer]: ...
 
     def unpack(self, frames: np.ndarray, state: MotorState, now: float) -> int: ...
 
@@ -170,7 +179,9 @@ class CanBus:
             return np.concatenate(asked)
 
         def take(frames: np.ndarray) -> bool:
-            answers.update((row, v) for row, r, v in self._codec.unpack_registers(frames) if r == register)
+            for answer in self._codec.unpack_registers(frames):
+                if answer.register == register and answer.written == (value is not None):
+                    answers[answer.row] = answer.value
             return len(answers) == len(motors)
 
         if not self._converse(request, take, clock):

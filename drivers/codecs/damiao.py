@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from drivers.bus import BusError, BusSpec, MotorCommand, MotorSpec, MotorState
-from drivers.can_bus import RegisterCheck
+from drivers.can_bus import RegisterAnswer, RegisterCheck
 from drivers.codecs.mit import MitCodec, Ranges, words_of
 from drivers.wire import make_frames
 
@@ -239,11 +239,11 @@ class DamiaoCodec:
         data = pack_register(self._spec.motors[row].id, operation, register, value)
         return make_frames(np.array([BROADCAST_ID]), data[None])
 
-    def unpack_registers(self, frames: np.ndarray) -> list[tuple[int, str, float | int]]:
-        """(row, register, value) of every answer on the register channel among ``frames``."""
+    def unpack_registers(self, frames: np.ndarray) -> list[RegisterAnswer]:
+        """Every answer on the register channel among ``frames``."""
         rows, answers, _ = self._sort(frames)
-        found = zip(rows[answers].tolist(), frames["data"][answers], strict=True)
-        return [(row, r.register, r.value) for row, r in ((row, unpack_register(data)) for row, data in found)]
+        found = zip(rows[answers].tolist(), map(unpack_register, frames["data"][answers]), strict=True)
+        return [RegisterAnswer(row, r.register, r.value, r.operation == Operation.WRITE) for row, r in found]
 
     def unpack(self, frames: np.ndarray, state: MotorState, now: float) -> int:
         """Put the feedback among ``frames`` into ``state``, the latest of each motor last. Returns how many frames came

@@ -1,0 +1,178 @@
+"""How much of a CAN bus a wiring takes, and the exact length of a frame on it.
+
+A frame of d data bits and an identifier of 11 bits is start (1), identifier (11), remote and format flags (3), length (4),
+data (d), CRC-15 (15), then CRC delimiter (1), acknowledge (2), end of frame (7) and the space behind it (3). After five
+equal bits from the start to the end of the CRC the sender inserts one of the other value ("stuffing"), which itself
+counts as the first of the next five. Source: Bosch, "CAN Specification 2.0" (1991), part B, sections 3 and 5.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from drivers.bus import BusError, BusSpec
+from drivers.codecs.mit import words_of
+from drivers.open import PROTOCOLS, load
+from drivers.wire import EXTENDED, REMOTE
+
+LOAD_MAX = 0.7  # share of a bus to plan for: the rest is for retransmission and what else is on it
+CRC_POLYNOMIAL = 0x4599  # x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1
+TAIL_BITS = 1 + 2 + 7 + 3  # CRC delimiter, acknowledge, end of frame, inter-frame space: never stuffed
+
+
+class Budget(NamedTuple):
+    """What ticks at ``rate`` (Hz) put on a bus. Loads are shares of its bit rate."""
+
+    bus: str
+    rate: float
+    frames: int  # a tick: a command and an answer for each motor
+    bits: float  # a tick, typical
+    bits_worst: float  # a tick, the most that stuffing can make of it
+    load: float
+    load_worst: float
+    rate_max: float  # Hz at a typical load of LOAD_MAX
+
+    def __str__(self) -> str:
+        return (
+            f"bus {self.bus}: {self.frames} frames a tick at {self.rate:g} Hz, load {self.load:.0%} typical, "
+            f"{self.load_worst:.0%} worst; best rate {self.rate_max:.0f} Hz"
+        )
+
+
+def budget(spec: BusSpec, rate: float) -> Budget:
+    """The load of ``spec`` when every motor is commanded and answers ``rate`` times a second."""
+    n = len(spec.motors)
+    typical, worst = (n * bits for bits in load(PROTOCOLS[spec.protocol].codec).TICK_BITS)
+    return Budget(
+        bus=spec.name,
+        rate=rate,
+        frames=2 * n,
+        bits=typical,
+        bits_worst=worst,
+        load=typical * rate / spec.bitrate,
+        load_worst=worst * rate / spec.bitrate,
+        rate_max=LOAD_MAX * spec.bitrate / typical,
+    )
+
+
+def check(spec: BusSpec, rate: float) -> Budget:
+    """The same. Raises BusError if the worst case does not fit into the bus: then commands would queue up and age."""
+    b = budget(spec, rate)
+    if b.load_worst > 1.0:
+        raise BusError(
+            f"bus {spec.name}: {len(spec.motors)} motors at {rate:g} Hz need {b.load_worst:.0%} of {spec.bitrate} bit/s "
+            f"in the worst case, expected at most 100 %.\n  Lower the rate (at most {b.rate_max:.0f} Hz is sensible), or "
+            "move motors to another bus"
+        )
+    return b
+
+
+# A standard frame with 8 bytes has 98 bits from the start to the end of the CRC: 7 chunks of 14. The state between two
+# chunks is the last bit and how many like it came in a row (1 to 4; the fifth is followed by a stuff bit at once), and
+# one table of 8 states x 2^14 chunks tells the next state and the stuff bits. Before the frame: a 1, once.
+CHUNK_BITS = 14
+CHUNK = 1 << CHUNK_BITS
+START = 4 * CHUNK  # state (1, once)
+_SHIFTS = np.array([55, 41, 27, 13], np.uint64)[:, None]  # of the payload, for chunks 1 to 4
+
+
+def frame_bits(frames: np.ndarray) -> np.ndarray:
+    """Bits (n,) int64 that each of ``frames`` (FRAME, (n,)) takes on the wire, with stuff bits and the space behind it."""
+    ids = frames["id"]
+    plain = (ids < 0x800) & (frames["length"] == 8)
+    if plain.all():
+        return _plain_bits(ids, frames["data"])
+    bits = np.empty(len(frames), np.int64)
+    bits[plain] = _plain_bits(ids[plain], frames["data"][plain])
+    bits[~plain] = [_any_bits(frame) for frame in frames[~plain]]
+    return bits
+
+
+def _plain_bits(ids: np.ndarray, data: np.ndarray) -> np.ndarray:
+    """The same for standard data frames with 8 bytes: identifiers (n,), payloads (n, 8) uint8."""
+    stuffing, crc_of = _tables()
+    words = words_of(data)
+    chunks = np.empty((7, len(ids)), np.int64)
+    chunks[0] = ids
+    chunks[0] <<= 2  # start, identifier, remote and format flags, length 8 = 01000 from here on
+    chunks[1:5] = words >> _SHIFTS & np.uint64(CHUNK - 1)
+    chunks[1] = chunks[1] & 0x1FF | 0b01000 << 9
+    chunks[5] = (words & np.uint64(0x1FFF)) << np.uint64(1)
+    crc = np.bitwise_xor.reduce(crc_of.take(chunks[:6] + _CRC_OFFSETS), axis=0)
+    chunks[5] |= crc >> CHUNK_BITS
+    chunks[6] = crc & (CHUNK - 1)
+
+    entries = np.empty_like(chunks)
+    state: np.ndarray | int = START
+    for chunk, entry in zip(chunks, entries, strict=True):
+        stuffing.take(chunk | state, out=entry)
+        state = entry & -CHUNK
+    return (entries & (CHUNK - 1)).sum(axis=0) + (7 * CHUNK_BITS + TAIL_BITS)
+
+
+_CRC_OFFSETS = (np.arange(6) * CHUNK)[:, None]
+
+
+@cache
+def _tables() -> tuple[np.ndarray, np.ndarray]:
+    """(8 * CHUNK,) next state * CHUNK + stuff bits, at state * CHUNK + chunk; and (6 * CHUNK,) the CRC of each chunk.
+
+    The CRC starts at 0 and is linear over GF(2): that of a frame is the exclusive or of those of its chunks.
+    """
+    state, chunk = np.divmod(np.arange(8 * CHUNK), CHUNK)
+    last, run = np.divmod(state, 4)
+    run += 1
+    stuffed = np.zeros_like(state)
+    for shift in reversed(range(CHUNK_BITS)):
+        bit = chunk >> shift & 1
+        run = np.where(bit == last, run + 1, 1)
+        full = run == 5
+        stuffed += full
+        last = np.where(full, 1 - bit, bit)
+        run[full] = 1
+    stuffing = (last * 4 + run - 1) * CHUNK + stuffed
+
+    contribution = [CRC_POLYNOMIAL]  # of the last of the 83 bits, then of the one before it, ...
+    while len(contribution) < 83:
+        contribution.append(_crc_step(contribution[-1], 0))
+    contribution = [0, *contribution]  # chunk 5 ends in the first bit of the CRC itself
+    chunk = np.arange(CHUNK)
+    crc_of = np.zeros((6, CHUNK), np.int64)
+    for k in range(6):
+        for b in range(CHUNK_BITS):
+            crc_of[k] ^= np.where(chunk >> b & 1, contribution[(5 - k) * CHUNK_BITS + b], 0)
+    return stuffing, crc_of.reshape(-1)
+
+
+def _any_bits(frame: np.ndarray) -> int:
+    """One frame of any kind, bit by bit."""
+    id, length = int(frame["id"]), int(frame["length"])
+    remote = f"{bool(id & REMOTE):b}"
+    if id & EXTENDED:
+        id29 = f"{id & 0x1FFF_FFFF:029b}"
+        head = "0" + id29[:11] + "11" + id29[11:] + remote + "00"
+    else:
+        head = "0" + f"{id & 0x7FF:011b}" + remote + "00"
+    payload = frame["data"][: 0 if id & REMOTE else length]
+    bits = head + f"{length:04b}" + "".join(f"{byte:08b}" for byte in payload.tolist())
+    crc = 0
+    for bit in bits:
+        crc = _crc_step(crc, int(bit))
+    bits += f"{crc:015b}"
+
+    stuffed, last, run = 0, "1", 1
+    for bit in bits:
+        run = run + 1 if bit == last else 1
+        last = bit
+        if run == 5:
+            stuffed, last, run = stuffed + 1, "01"[bit == "0"], 1
+    return len(bits) + stuffed + TAIL_BITS
+
+
+def _crc_step(crc: int, bit: int) -> int:
+    """The CRC-15 register after one more bit."""
+    carry = crc >> 14 ^ bit
+    return (crc << 1 & 0x7FFF) ^ (CRC_POLYNOMIAL if carry else 0)

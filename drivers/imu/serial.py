@@ -1,0 +1,74 @@
+"""IMUs that stream packets over a serial wire."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from drivers.bus import BusCounters, BusError, ImuSpec, ImuState
+from drivers.wire import SerialWire, WireError
+
+NORM_TOLERANCE = 0.01  # of a quaternion
+
+
+class ImuPacket(Protocol):
+    """What a packet must say, in SI units and the sensor's own frame."""
+
+    @property
+    def orientation(self) -> np.ndarray: ...  # (4,) w, x, y, z
+
+    @property
+    def angular_velocity(self) -> np.ndarray: ...  # (3,) rad/s
+
+    @property
+    def acceleration(self) -> np.ndarray: ...  # (3,) m/s^2, +g upwards at rest
+
+
+class ImuParser(Protocol):
+    """A codec of such packets, fed with bytes as they come."""
+
+    rejected: int
+
+    def feed(self, data: bytes) -> list[Any]:
+        """Every ImuPacket completed by ``data``, oldest first."""
+        ...
+
+
+class SerialImu:
+    """An IMU on a serial wire (a ``drivers.bus.Imu``)."""
+
+    def __init__(self, spec: ImuSpec, parser: ImuParser, wire: SerialWire) -> None:
+        self.spec = spec
+        self.counters = BusCounters()
+        self._parser = parser
+        self._wire = wire
+        self._state = ImuState.empty()
+        self._implausible = 0
+
+    def read(self, now: float) -> ImuState:
+        """A packet that is not finite, or whose quaternion is not of length 1, is rejected and leaves the state old.
+        Raises BusError if the port is gone."""
+        try:
+            data = self._wire.read()
+        except WireError as error:
+            raise BusError(f"imu {self.spec.protocol} ({self.spec.channel}): {error}") from error
+        packets = self._parser.feed(data)
+        self.counters.received += len(packets)
+        for p in packets:
+            if self._plausible(p):
+                self._state.orientation_imu_in_world[:] = p.orientation
+                self._state.angular_velocity_imu_in_imu[:] = p.angular_velocity
+                self._state.acceleration_imu_in_imu[:] = p.acceleration
+                self._state.time = now
+            else:
+                self._implausible += 1
+        self.counters.rejected = self._parser.rejected + self._implausible
+        return self._state
+
+    def close(self) -> None:
+        self._wire.close()
+
+    def _plausible(self, p: ImuPacket) -> bool:
+        finite = np.isfinite(p.angular_velocity).all() and np.isfinite(p.acceleration).all()
+        return bool(finite and abs(np.linalg.norm(p.orientation) - 1.0) < NORM_TOLERANCE)

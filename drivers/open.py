@@ -1,0 +1,95 @@
+"""The one registry: which class speaks a protocol, and which carries an interface. Classes are imported when opened."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from importlib import import_module
+from typing import Any, NamedTuple
+
+from drivers.bus import BusError, BusSpec, Imu, ImuSpec, MotorBus
+from drivers.wire import WireError
+
+
+class BusProtocol(NamedTuple):
+    """A motor protocol: the kind of wire that it runs on, its bus class and its codec ("module:Class")."""
+
+    wire: str
+    bus: str
+    codec: str
+
+
+PROTOCOLS: dict[str, BusProtocol] = {
+    "damiao": BusProtocol("can", "drivers.can_bus:CanBus", "drivers.codecs.damiao:DamiaoCodec"),
+}
+
+IMUS: dict[str, str] = {
+    "hipnuc": "drivers.codecs.hipnuc:Parser",
+}
+
+
+def open_bus(spec: BusSpec, wire: Any = None) -> MotorBus:
+    """The bus of ``spec``, not yet connected; on ``wire`` where given, else on the one that its interface names.
+
+    Raises BusError for an unknown protocol or interface, a wiring that the protocol cannot carry, or a busy port.
+    """
+    codec = open_codec(spec)
+    return load(PROTOCOLS[spec.protocol].bus)(spec, codec, open_wire(spec) if wire is None else wire)
+
+
+def open_codec(spec: BusSpec) -> Any:
+    """The host's codec for the motors of ``spec``, without any wire. Raises BusError."""
+    _known("protocol", spec.protocol, PROTOCOLS, f"bus {spec.name}")
+    return load(PROTOCOLS[spec.protocol].codec)(spec)
+
+
+def open_imu(spec: ImuSpec, wire: Any = None) -> Imu:
+    """The IMU of ``spec``; on ``wire`` where given, else on the one that its interface names. Raises BusError."""
+    _known("protocol", spec.protocol, IMUS, "imu")
+    parser = load(IMUS[spec.protocol])()
+    return load("drivers.imu.serial:SerialImu")(spec, parser, open_wire(spec) if wire is None else wire)
+
+
+def open_wire(spec: BusSpec | ImuSpec) -> Any:
+    """The wire that ``spec.interface`` and ``spec.channel`` name. Raises BusError.
+
+    ``sim``: a simulated bus served on the unix socket ``channel``. CAN: ``socketcan``, or any interface of python-can.
+    Serial: ``serial``.
+    """
+    is_bus = isinstance(spec, BusSpec)
+    where = f"bus {spec.name}" if is_bus else "imu"
+    try:
+        if is_bus:
+            _known("protocol", spec.protocol, PROTOCOLS, where)
+        if is_bus and PROTOCOLS[spec.protocol].wire == "can":
+            return _open_can(spec, where)
+        _known("interface", spec.interface, ("serial", "sim"), where)
+        if spec.interface == "sim":
+            return load("drivers.sim.socket_wire:SocketSerialWire")(spec.channel)
+        return load("drivers.serial_wire:PySerialWire")(spec.channel, spec.bitrate if is_bus else spec.baud)
+    except WireError as error:
+        raise BusError(f"{where}: {error}") from error
+
+
+def _open_can(spec: BusSpec, where: str) -> Any:
+    if spec.interface == "sim":
+        return load("drivers.sim.socket_wire:SocketCanWire")(spec.channel)
+    if spec.interface == "socketcan":
+        return load("drivers.can_wire:RawCanWire").open(spec.channel)
+    import can
+
+    _known("interface", spec.interface, ("sim", *sorted(can.VALID_INTERFACES)), where)
+    return load("drivers.can_wire:PythonCanWire")(spec.interface, spec.channel, spec.bitrate)
+
+
+def load(path: str) -> Any:
+    """What ``module:Name`` names."""
+    module, name = path.split(":")
+    return getattr(import_module(module), name)
+
+
+def _known(what: str, name: str, options: Iterable[str], where: str) -> None:
+    if name not in options:
+        close = difflib.get_close_matches(name, options, n=1)
+        hint = f" (did you mean '{close[0]}'?)" if close else ""
+        raise BusError(f"{where}: got {what} '{name}'{hint}, expected one of {', '.join(options)}")

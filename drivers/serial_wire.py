@@ -1,0 +1,48 @@
+"""Serial wire (UART, USB serial, RS-485) over pyserial."""
+
+from __future__ import annotations
+
+from drivers.wire import WireError, WireFull
+
+READ_SIZE = 65536  # bytes: more than any tick brings
+
+
+class PySerialWire:
+    """A serial port, 8N1, opened exclusively."""
+
+    def __init__(self, device: str, baud: int) -> None:
+        """Raises WireError if the port is absent, busy or not ours to open."""
+        import serial
+
+        self._where = f"serial {device} at {baud} baud"
+        self._error = (serial.SerialException, OSError)  # the former is an OSError in pyserial 3, by name elsewhere
+        try:
+            self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
+        except (*self._error, ValueError) as error:
+            raise WireError(
+                f"{self._where}: {error}\n  Is it plugged in, free, and is this user in the group that owns it (dialout)?"
+            ) from None
+        try:
+            self._port.set_low_latency_mode(True)  # FTDI: 1 ms instead of 16 between two deliveries
+        except (*self._error, ValueError, AttributeError):
+            pass  # not an adapter with such a timer
+
+    def write(self, data: bytes) -> None:
+        try:
+            sent = self._port.write(data) or 0
+        except self._error as error:
+            raise WireError(f"{self._where}: writing: {error}; unplugged?") from None
+        if sent < len(data):
+            raise WireFull(f"{self._where}: sent {sent} of {len(data)} bytes; the rest was dropped")
+
+    def read(self) -> bytes:
+        try:
+            return self._port.read(READ_SIZE)
+        except self._error as error:
+            raise WireError(f"{self._where}: reading: {error}; unplugged?") from None
+
+    def fileno(self) -> int:
+        return self._port.fileno()
+
+    def close(self) -> None:
+        self._port.close()
