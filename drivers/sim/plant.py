@@ -171,10 +171,10 @@ class Plant:
         b, d = self._hook_body, self.data
         hook = d.xpos[b] + d.xmat[b].reshape(3, 3) @ self._hook_in_body
         spin = d.cvel[b, :3]
-        velocity = d.cvel[b, 3:] + np.cross(spin, hook - d.subtree_com[self._root])
+        velocity = d.cvel[b, 3:] + _cross(spin, hook - d.subtree_com[self._root])
         force, torque = self.gantry.wrench(hook, velocity, spin, self.timestep)
         d.xfrc_applied[b, :3] = force
-        d.xfrc_applied[b, 3:] = torque + np.cross(hook - d.xipos[b], force)
+        d.xfrc_applied[b, 3:] = torque + _cross(hook - d.xipos[b], force)
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
@@ -238,6 +238,12 @@ class Plant:
             tilt=self.tilt,
             fallen=self.fallen,
         )
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """As numpy's, which spends 20 us on the general case."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def _fit(spec: mujoco.MjSpec, path: str | Path, joints: Sequence[str], base: str, imu_site: str) -> None:

@@ -1,0 +1,189 @@
+"""The simulated IMU: HiPNUC packets at a fixed rate, byte by byte down a serial line.
+
+Samples are white noise and constant biases on the truth at a site of the plant; a packet becomes readable as its bytes
+arrive at the line's speed plus ``latency``. Not modelled: the sensor's own fusion filter (its lag and yaw drift),
+scale errors, vibration, saturation, temperature.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.bus import BusError, ImuSpec
+from drivers.codecs import hipnuc
+from drivers.sim.faults import IMU, Fault
+from drivers.wire import WireError
+
+PROTOCOL = "hipnuc"
+BITS_PER_BYTE = 10  # 8N1
+BLOCK = 256  # samples of noise drawn at once
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Standard deviation of a sample, and constant bias (each axis). Default: a good MEMS unit."""
+
+    orientation: float = 0.001  # rad
+    angular_velocity: float = 0.003  # rad/s
+    acceleration: float = 0.03  # m/s^2
+    angular_velocity_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rad/s
+    acceleration_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m/s^2
+
+
+class SimImu:
+    """Samples ``body`` (a drivers.sim.plant.Plant) every 1/rate s."""
+
+    def __init__(self, spec: ImuSpec, body, *, seed: int = 0, noise: ImuNoise | None = None, latency: float = 250e-6):
+        if spec.protocol != PROTOCOL:
+            raise BusError(f"IMU: no emulation of '{spec.protocol}', expected {PROTOCOL}")
+        self.spec, self.noise = spec, noise or ImuNoise()
+        self._body, self._latency = body, latency
+        self._byte_time = BITS_PER_BYTE / spec.baud
+        self._packets: deque[list] = deque()  # [start, bytes, how many of them were read]
+        self._free = 0.0
+        self._samples = 0
+        self._faults: list[Fault] = []
+        self._stuck: dict[int, bytes] = {}
+        self._random = random.Random(f"{seed}/{IMU}")
+        self._generator = np.random.default_rng([seed, 0x1A])
+        self._scale = np.repeat([self.noise.orientation / 2, self.noise.angular_velocity, self.noise.acceleration], 3)
+        self._mean = np.concatenate([np.zeros(3), self.noise.angular_velocity_bias, self.noise.acceleration_bias])
+        w, x, y, z = spec.orientation_imu_in_base
+        self._mount = None if (w, x, y, z) == (1, 0, 0, 0) else np.array([w, x, y, z]) / math.hypot(w, x, y, z)
+        self.carried: list[bytes] = []  # packets since the last digest
+
+    def sample(self, now: float) -> None:
+        """Send what is due by ``now``: a packet of the body's present state."""
+        if now + 1e-9 < (self._samples + 1) / self.spec.rate:
+            return
+        self._samples += 1
+        at = self._samples % BLOCK
+        if at == 1 or self._samples == 1:
+            self._block = self._generator.standard_normal((BLOCK, 9)) * self._scale + self._mean
+        noise = self._block[at]
+        body = self._body
+        orientation = body.orientation_imu_in_world
+        spin, acceleration = body.angular_velocity_imu_in_imu, body.acceleration_imu_in_imu
+        if self._mount is not None:
+            orientation = multiply(orientation, self._mount)
+            frame = matrix(self._mount)
+            spin, acceleration = frame.T @ spin, frame.T @ acceleration
+        orientation = multiply(orientation, (1.0, noise[0], noise[1], noise[2]))
+        packet = hipnuc.pack(
+            hipnuc.Hi91(
+                timestamp=now,
+                temperature=40.0,
+                acceleration=acceleration + noise[6:9],
+                angular_velocity=spin + noise[3:6],
+                orientation=orientation / math.sqrt(float(orientation @ orientation)),
+                status=0,
+            )
+        )
+        self._send(packet, now)
+
+    def _send(self, packet: bytes, now: float) -> None:
+        copies, start = 1, now
+        for fault in self._faults:
+            if not fault.start <= now < fault.end or self._random.random() >= fault.probability:
+                continue
+            if fault.kind in ("drop", "off"):
+                return
+            if fault.kind == "delay":
+                start += fault.value
+            elif fault.kind == "duplicate":
+                copies = 2
+            elif fault.kind == "stuck":
+                packet = self._stuck.setdefault(id(fault), packet)
+            else:
+                packet = self._lie(fault.kind, packet)
+        for _ in range(copies):
+            self._packets.append([max(start, self._free), packet, 0])
+            self._free = max(start, self._free) + len(packet) * self._byte_time
+            self.carried.append(packet)
+
+    def _lie(self, kind: str, packet: bytes) -> bytes:
+        payload = bytearray(packet[hipnuc.HEAD_SIZE :])
+        if kind == "garbage":
+            payload[1:] = self._random.randbytes(len(payload) - 1)
+            return hipnuc.frame(bytes(payload))
+        at = self._random.randrange(8, 8 * len(payload))
+        payload[at // 8] ^= 1 << at % 8
+        if kind == "wrong":
+            return hipnuc.frame(bytes(payload))
+        return packet[: hipnuc.HEAD_SIZE] + bytes(payload)  # corrupt: the CRC no longer fits
+
+    def inject(self, fault: Fault) -> None:
+        self._faults.append(fault)
+
+    def read(self, now: float) -> bytes:
+        """The bytes that have arrived by ``now``."""
+        out = b""
+        while self._packets:
+            entry = self._packets[0]
+            start, packet, taken = entry
+            there = min(len(packet), math.floor((now - self._latency - start) / self._byte_time + 1e-6))
+            if there <= taken:
+                break
+            out += packet[taken:there]
+            if there == len(packet):
+                self._packets.popleft()
+            else:
+                entry[2] = there
+                break
+        return out
+
+
+class SimSerialWire:
+    """The host's end of the IMU's line: a drivers.wire.SerialWire. What the host writes is ignored."""
+
+    def __init__(self, imu: SimImu, now: Callable[[], float]):
+        self._imu, self._now, self._open = imu, now, True
+
+    def write(self, data: bytes) -> None:
+        self._check()
+
+    def read(self) -> bytes:
+        self._check()
+        return self._imu.read(self._now())
+
+    def _check(self) -> None:
+        if not self._open:
+            raise WireError("imu: used after close; open the wire again")
+
+    def fileno(self) -> int:
+        return -1
+
+    def close(self) -> None:
+        self._open = False
+
+
+def multiply(a, b) -> np.ndarray:
+    """Product of two quaternions (w, x, y, z)."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return np.array(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )
+
+
+def matrix(q) -> np.ndarray:
+    """Rotation matrix (3, 3) of a unit quaternion."""
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )

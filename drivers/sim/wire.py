@@ -1,0 +1,350 @@
+"""A simulated classic CAN bus: every frame takes its exact time on the wire, and the lowest identifier goes first.
+
+The host is a controller with one FIFO (so that its later, more urgent frames wait behind earlier ones); every motor is a
+node of its own that answers ``reply_delay`` after a frame has ended. An adapter adds ``latency`` either way. A frame
+that nobody on the bus acknowledges is sent again for ever, as real controllers do: then the queue fills up.
+
+Not modelled: error-passive nodes, overload frames, two nodes sending one identifier at once, clock tolerance, CAN FD.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import random
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from heapq import heapify, heappop, heappush
+from typing import Protocol
+
+import numpy as np
+
+from drivers.bus import BusSpec
+from drivers.sim.faults import FEEDBACK, HOST, POWER, Fault
+from drivers.wire import EXTENDED, FRAME, WireError, WireFull
+
+ERROR_FRAME_BITS = 20  # error flag (6), its superposition (up to 6), delimiter (8), as good as always
+BUS_OFF_COUNT = 256  # ISO 11898-1: transmit error counter above which a controller leaves the bus
+RESTART = 0.1  # s: how long the host then stays away (restart-ms 100, the usual setting)
+QUEUE_LENGTH = 128  # frames; Linux' default of 10 is too small for a tick (set txqueuelen 128)
+BROADCAST_ID = 0x7FF
+
+
+class Reply(tuple):
+    """(arbitration key, raw frame, bits) of what a motor answers."""
+
+
+class Motors(Protocol):
+    """What a wire asks of the motors on it. ``row``: a motor's index over all buses."""
+
+    powered: list[bool]
+
+    def receive(self, bus: int, id: int, raw: bytes, time: float) -> tuple[int, int, bytes, int] | None:
+        """A frame that ended at ``time``: the answer (row, key, raw frame, bits), or None."""
+        ...
+
+
+@dataclass
+class Traffic:
+    """Counted since the start."""
+
+    frames: int = 0  # carried whole
+    busy: float = 0.0  # s the wire was taken
+    dropped: int = 0  # carried, but heard by nobody (a fault)
+    corrupted: int = 0  # broken off by an error frame
+    overflowed: int = 0  # refused: queue full
+    bus_off: int = 0  # how often the host's controller left the bus
+
+
+def priority(id: int) -> int:
+    """Arbitration key of an identifier, the lowest wins: base identifier first, and a standard frame before an extended
+    one with the same base (ISO 11898-1)."""
+    if id & EXTENDED:
+        return (id >> 18 & 0x7FF) << 19 | 1 << 18 | id & 0x3FFFF
+    return (id & 0x7FF) << 19
+
+
+class SimCan:
+    """One bus. ``carry(until)`` lets it work; ``send`` and ``recv`` are the host's end (see SimCanWire)."""
+
+    def __init__(
+        self,
+        spec: BusSpec,
+        index: int,
+        first_row: int,
+        motors: Motors,
+        *,
+        seed: int = 0,
+        latency: float = 250e-6,
+        reply_delay: float = 50e-6,
+        queue_length: int = QUEUE_LENGTH,
+    ):
+        self.spec, self.index, self.traffic = spec, index, Traffic()
+        self.rows = {m.id: first_row + i for i, m in enumerate(spec.motors)}
+        self.sent: list[tuple[float, np.ndarray]] = []  # by the host, not yet timed
+        self.inbox: deque[tuple[float, bytes]] = deque()  # (arrival at the host, raw frame)
+        self.carried: list[bytes] = []  # raw frames since the last ``digest``
+        self._motors, self._latency, self._reply_delay, self._room = motors, latency, reply_delay, queue_length
+        self._bit = 1.0 / spec.bitrate
+        self._queue: deque[tuple] = deque()  # the host's: (ready, key, id, raw, bits, held)
+        self._waiting: list[tuple] = []  # heap of answers not ready yet: (ready, key, order, raw, bits, row, held)
+        self._contending: list[tuple] = []  # heap of answers that want the wire: (key, order, raw, bits, row, held)
+        self._free = 0.0  # when the wire is idle again
+        self._order = 0
+        self._errors = 0  # the host's transmit error counter
+        self._away_until = -1.0
+        self._faults: list[tuple[Fault, frozenset[int]]] = []
+        self._host_faults: list[Fault] = []
+        self._stuck: dict[tuple[int, int], bytes] = {}
+        self._random = random.Random(f"{seed}/{spec.name}")
+
+    # -- the host's end ----------------------------------------------------------------------------------------------
+
+    def send(self, frames: np.ndarray, now: float) -> None:
+        """Queue frames (FRAME, (n,)). Raises WireFull, or WireError while the controller is off the bus."""
+        for fault in self._host_faults:
+            if fault.start <= now < fault.end and self._random.random() < fault.probability:
+                if fault.kind == "bus_off":
+                    raise WireError(f"{self.spec.name}: bus off at {now:.3f} s; check cable and termination")
+                self._refuse(len(frames), 0)
+        if now < self._away_until:
+            raise WireError(f"{self.spec.name}: bus off at {now:.3f} s after too many transmit errors")
+        room = max(0, self._room - len(self._queue) - sum(len(f) for _, f in self.sent))
+        if room:
+            self.sent.append((now + self._latency, frames[:room].copy()))
+        if len(frames) > room:
+            self._refuse(len(frames), room)
+
+    def _refuse(self, wanted: int, taken: int) -> None:
+        self.traffic.overflowed += wanted - taken
+        raise WireFull(
+            f"{self.spec.name}: transmit queue took {taken} of {wanted} frames (room for {self._room}); "
+            "the bus is too slow, or nobody acknowledges"
+        )
+
+    def recv(self, now: float) -> np.ndarray:
+        """Frames (FRAME, (n,)) that have reached the host by ``now``."""
+        inbox, raws = self.inbox, []
+        while inbox and inbox[0][0] <= now:
+            raws.append(inbox.popleft()[1])
+        return np.frombuffer(b"".join(raws), FRAME)
+
+    # -- the wire ----------------------------------------------------------------------------------------------------
+
+    def take(self, frames: np.ndarray, ready: float, bits: list[int]) -> None:
+        """Timed frames of the host enter its controller's queue."""
+        raw = frames.tobytes()
+        for i, id in enumerate(frames["id"].tolist()):
+            self._queue.append((ready, priority(id), id, raw[16 * i : 16 * i + 16], bits[i], False))
+
+    @property
+    def busy(self) -> bool:
+        """Somebody wants to send, or something is on its way to the host."""
+        return bool(self._queue or self._waiting or self._contending or self.sent or self.inbox)
+
+    @property
+    def idle(self) -> bool:
+        """The wire itself has nothing to do."""
+        return not (self._queue or self._waiting or self._contending)
+
+    def carry(self, until: float) -> None:
+        """Let the wire work until ``until``: every frame that ends by then is delivered."""
+        queue, waiting, contending, powered = self._queue, self._waiting, self._contending, self._motors.powered
+        receive, bus, delay, bit = self._motors.receive, self.index, self._reply_delay, self._bit
+        faults = [f for f in self._faults if f[0].start < until and f[0].end > self._free] if self._faults else ()
+        away = self._away(until)
+        if away or (queue and not any(powered[row] for row in self.rows.values())):
+            self._stall(until, away)
+            return
+        traffic, carried, inbox, latency = self.traffic, self.carried, self.inbox, self._latency
+        while True:
+            start = self._free
+            if not contending:
+                first = queue[0][0] if queue else until
+                if waiting and waiting[0][0] < first:
+                    first = waiting[0][0]
+                if first > start:
+                    start = first
+            if start >= until:
+                return
+            while waiting and waiting[0][0] <= start:
+                _, key, order, raw, bits, row, held = heappop(waiting)
+                heappush(contending, (key, order, raw, bits, row, held))
+            self._free = start
+            if queue and queue[0][0] <= start and (not contending or queue[0][1] < contending[0][0]):
+                _, _, id, raw, bits, held = queue[0]
+                end = start + bits * bit
+                if end > until:
+                    return
+                queue.popleft()
+                copies = self._spoil_command(faults, start, id, raw, bits, held) if faults else 1
+                if copies is None:
+                    continue
+                self._free = end
+                traffic.busy += end - start
+                traffic.frames += 1
+                carried.append(raw)
+                if self._errors:
+                    self._errors -= 1
+                for _ in range(copies):
+                    answer = receive(bus, id, raw, end)
+                    if answer is not None:
+                        row, key, reply, bits = answer
+                        self._order += 1
+                        heappush(waiting, (end + delay, key, self._order, reply, bits, row, False))
+            else:
+                _, _, raw, bits, row, held = contending[0]
+                end = start + bits * bit
+                if end > until:
+                    return
+                key, order, raw, bits, row, held = heappop(contending)
+                if not powered[row]:
+                    continue
+                copies = 1
+                if faults:
+                    copies, raw = self._spoil_feedback(faults, start, key, raw, bits, row, held)
+                    if copies is None:
+                        continue
+                self._free = end
+                traffic.busy += end - start
+                traffic.frames += 1
+                carried.append(raw)
+                for _ in range(copies):
+                    inbox.append((end + latency, raw))
+
+    def _away(self, until: float) -> bool:
+        """Whether the host's controller is off the bus now."""
+        now = self._free if not self.idle else until
+        return now < self._away_until or any(
+            f.kind == "bus_off" and f.start < until and until <= f.end for f in self._host_faults
+        )
+
+    def _stall(self, until: float, away: bool) -> None:
+        """Nobody acknowledges (the first frame is sent for ever), or the host is gone (what it had queued is lost)."""
+        if away:
+            self._queue.clear()
+        elif self._queue[0][0] < until:
+            self.traffic.busy += until - max(self._free, self._queue[0][0])
+        self._waiting.clear()
+        self._contending.clear()
+        self._free = max(self._free, until)
+
+    # -- faults ------------------------------------------------------------------------------------------------------
+
+    def inject(self, fault: Fault) -> None:
+        """Add a fault that befalls this bus (POWER faults are the motors' own)."""
+        if fault.kind in HOST:
+            self._host_faults.append(fault)
+        elif fault.kind not in POWER:
+            names = {self.rows[m.id]: m.joint for m in self.spec.motors}
+            rows = frozenset(row for row, joint in names.items() if fault.befalls(self.spec.name, joint))
+            self._faults.append((fault, rows))
+
+    def _hits(self, faults, start: float, row: int):
+        for fault, rows in faults:
+            everyone = fault.motor == "*"
+            if fault.start <= start < fault.end and (everyone or row in rows):
+                if fault.probability >= 1.0 or self._random.random() < fault.probability:
+                    yield fault
+
+    def _spoil_command(self, faults, start, id, raw, bits, held) -> int | None:
+        """How often the host's frame is heard; None: it was not carried (broken off, or held back)."""
+        copies = 1
+        row = self.rows.get(raw[8] | raw[9] << 8 if id == BROADCAST_ID else id, -1)
+        for fault in self._hits(faults, start, row):
+            if fault.kind == "drop":
+                copies = 0
+                self.traffic.dropped += 1
+            elif fault.kind == "duplicate":
+                copies = 2
+            elif fault.kind == "delay" and not held:
+                self._queue.appendleft((start + fault.value, priority(id), id, raw, bits, True))
+                return None
+            elif fault.kind == "corrupt":
+                self._break_off(start, bits)
+                self._errors += 8
+                if self._errors >= BUS_OFF_COUNT:
+                    self._errors = 0
+                    self.traffic.bus_off += 1
+                    self._away_until = start + RESTART
+                    self._queue.clear()
+                else:
+                    self._queue.appendleft((self._free, priority(id), id, raw, bits, held))
+                return None
+        return copies
+
+    def _spoil_feedback(self, faults, start, key, raw, bits, row, held) -> tuple[int | None, bytes]:
+        """How often a motor's frame is heard (None: it was not carried), and what it says by then."""
+        copies: int | None = 1
+        for fault in self._hits(faults, start, row):
+            if fault.kind == "drop":
+                copies = 0
+                self.traffic.dropped += 1
+            elif fault.kind == "duplicate":
+                copies = 2
+            elif fault.kind == "delay" and not held:
+                self._order += 1
+                heappush(self._waiting, (start + fault.value, key, self._order, raw, bits, row, True))
+                return None, raw
+            elif fault.kind == "corrupt":
+                self._break_off(start, bits)
+                self._order += 1
+                heappush(self._waiting, (self._free, key, self._order, raw, bits, row, held))
+                return None, raw
+            elif fault.kind in FEEDBACK:
+                raw = self._lie(fault, row, raw)
+        return copies, raw
+
+    def _break_off(self, start: float, bits: int) -> None:
+        spent = (bits + ERROR_FRAME_BITS) * self._bit
+        self._free = start + spent
+        self.traffic.busy += spent
+        self.traffic.corrupted += 1
+
+    def _lie(self, fault: Fault, row: int, raw: bytes) -> bytes:
+        if fault.kind == "stuck":
+            return self._stuck.setdefault((id(fault), row), raw)
+        if fault.kind == "garbage":
+            return raw[:8] + self._random.randbytes(8)
+        at = self._random.randrange(64)
+        data = bytearray(raw)
+        data[8 + at // 8] ^= 1 << at % 8
+        return bytes(data)
+
+    def forget(self, row: int) -> None:
+        """A motor lost its power: what it wanted to say is gone."""
+        self._waiting = [w for w in self._waiting if w[5] != row]
+        self._contending = [c for c in self._contending if c[4] != row]
+        heapify(self._waiting)
+        heapify(self._contending)
+
+    def digest(self, sha: hashlib._Hash) -> None:
+        """Add what was carried since the last call, in its order."""
+        if self.carried:
+            sha.update(b"%d:" % self.index + b"".join(self.carried))
+            self.carried.clear()
+
+
+class SimCanWire:
+    """The host's end of a SimCan: a drivers.wire.CanWire. ``now`` tells simulated time."""
+
+    def __init__(self, bus: SimCan, now: Callable[[], float]):
+        self._bus, self._now, self._open = bus, now, True
+
+    def send(self, frames: np.ndarray) -> None:
+        self._check()
+        self._bus.send(frames, self._now())
+
+    def recv(self) -> np.ndarray:
+        self._check()
+        return self._bus.recv(self._now())
+
+    def _check(self) -> None:
+        if not self._open:
+            raise WireError(f"{self._bus.spec.name}: used after close; open the wire again")
+
+    def fileno(self) -> int:
+        return -1
+
+    def close(self) -> None:
+        self._open = False

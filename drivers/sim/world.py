@@ -1,0 +1,220 @@
+"""The simulated twin: a plant, its motors on their buses, and its IMU, moved on by one clock.
+
+``advance(until)`` lets everything happen up to a time: frames travel, motors obey, the plant moves. Nothing in here owns
+a thread or looks at a clock, so the same inputs and the same seed give the same bytes (``digest``).
+
+    host: wires[bus].send(frames) at time t
+      -> adapter latency -> wire (frame time, arbitration, faults) -> motor: answers, then obeys
+      -> wire -> adapter latency -> wires[bus].recv()
+
+Feedback tells the state at the start of the physics substep in which the motor was asked. For what the parts leave out,
+see the docstrings of plant.py, motor.py, wire.py and imu.py.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from heapq import heappop, heappush
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from drivers.budget import frame_bits
+from drivers.bus import BusError, BusSpec, ImuSpec
+from drivers.sim.faults import IMU, KINDS, POWER, Fault, parse_fault
+from drivers.sim.imu import ImuNoise, SimImu, SimSerialWire
+from drivers.sim.motor import MotorEvent, SimMotors
+from drivers.sim.plant import Plant, Truth
+from drivers.sim.wire import QUEUE_LENGTH, SimCan, SimCanWire
+
+if TYPE_CHECKING:
+    import mujoco
+
+TOLERANCE = 1e-9  # s: what a caller's arithmetic may be off by
+
+
+class World:
+    """A robot in MuJoCo behind simulated wires.
+
+    ``joint_pos``: where its joints start (by name, rad). ``hang``: metres of air under the feet while it hangs from the
+    gantry at the start; None: it stands, without gantry. ``noise``: uniform, rad, on the starting joints.
+    ``faults``: Faults or their text form. ``registers`` and ``wrap``: see SimMotors. ``prepare``: see Plant.
+    """
+
+    def __init__(
+        self,
+        model_path: str | Path,
+        base: str,
+        buses: Sequence[BusSpec],
+        imu: ImuSpec,
+        *,
+        timestep: float = 0.002,
+        seed: int = 0,
+        faults: Sequence[Fault | str] = (),
+        prepare: Callable[[mujoco.MjSpec], None] | None = None,
+        joint_pos: Mapping[str, float] | None = None,
+        hang: float | None = 0.01,
+        noise: float = 0.0,
+        registers: Mapping[str, Mapping[str, float]] | None = None,
+        wrap: bool = False,
+        imu_noise: ImuNoise | None = None,
+        latency: float = 250e-6,
+        reply_delay: float = 50e-6,
+        queue_length: int = QUEUE_LENGTH,
+    ):
+        joints = [m.joint for b in buses for m in b.motors]
+        self.time = 0.0
+        self.plant = Plant(model_path, joints, base, timestep, prepare, imu.site)
+        self.plant.reset(joint_pos, hang=hang, noise=noise, seed=seed)
+        self.motors = SimMotors(buses, self.plant, frame_bits, registers=registers, wrap=wrap)
+        self.buses: list[SimCan] = []
+        first = 0
+        for i, spec in enumerate(buses):
+            self.buses.append(
+                SimCan(spec, i, first, self.motors, seed=seed, latency=latency, reply_delay=reply_delay,
+                       queue_length=queue_length)
+            )  # fmt: skip
+            first += len(spec.motors)
+        self.imu = SimImu(imu, self.plant, seed=seed, noise=imu_noise, latency=latency)
+        now = lambda: self.time + TOLERANCE  # noqa: E731
+        self.wires = {bus.spec.name: SimCanWire(bus, now) for bus in self.buses}
+        self.imu_wire = SimSerialWire(self.imu, now)
+        self._timestep = timestep
+        self._substeps = 0  # done so far
+        self._sha = hashlib.sha256()
+        self._power: list[tuple[float, int, int, bool]] = []  # heap of (time, order, row, on)
+        for fault in faults:
+            self.inject(fault)
+
+    # -- time --------------------------------------------------------------------------------------------------------
+
+    def advance(self, until: float) -> None:
+        """Let everything happen up to ``until`` (s). The plant moves in whole substeps; the wires exactly."""
+        end = (self._substeps + 1) * self._timestep
+        while end <= until + TOLERANCE:
+            start = end - self._timestep
+            if self._power and self._power[0][0] <= start + TOLERANCE:
+                self._switch_power(start)
+            self._carry(end)
+            self.motors.act(start, end)
+            self.plant.step()
+            self._substeps += 1
+            self.time = end
+            self.imu.sample(end)
+            end = (self._substeps + 1) * self._timestep
+        if until > self.time + TOLERANCE:
+            self._carry(until)
+            self.time = until
+
+    def _carry(self, until: float) -> None:
+        self._price()
+        for bus in self.buses:
+            if not bus.idle:
+                bus.carry(until)
+                bus.digest(self._sha)
+        if self.imu.carried:
+            self._sha.update(b"imu:" + b"".join(self.imu.carried))
+            self.imu.carried.clear()
+
+    def _price(self) -> None:
+        """Give every frame that hosts sent its length on the wire, all in one pass."""
+        sent = [(bus, ready, frames) for bus in self.buses for ready, frames in bus.sent]
+        if not sent:
+            return
+        bits = self.motors.refresh(np.concatenate([frames for _, _, frames in sent]))
+        at = 0
+        for bus, ready, frames in sent:
+            bus.take(frames, ready, bits[at : at + len(frames)])
+            bus.sent.clear()
+            at += len(frames)
+
+    @property
+    def busy(self) -> bool:
+        """Frames are on their way."""
+        return any(bus.busy for bus in self.buses)
+
+    # -- things that happen to it ------------------------------------------------------------------------------------
+
+    def inject(self, fault: Fault | str) -> None:
+        """Make something go wrong. Raises BusError for a fault that befalls nothing here."""
+        fault = parse_fault(fault) if isinstance(fault, str) else fault
+        if fault.bus == IMU:
+            self.imu.inject(fault)
+            return
+        rows = [
+            row for row, (bus, joint) in enumerate(zip(self.motors.bus_names, self.motors.joints, strict=True))
+            if fault.befalls(bus, joint)
+        ]  # fmt: skip
+        if not rows:
+            names = ", ".join([*(b.spec.name for b in self.buses), IMU])
+            raise BusError(
+                f"fault '{fault.kind}': nothing here is '{fault.bus}/{fault.motor}', expected one of the buses {names} "
+                "and, after a slash, one of its joints"
+            )
+        if fault.kind in POWER:
+            back = fault.start + fault.value if fault.kind == "reboot" else fault.end
+            for row in rows:
+                heappush(self._power, (fault.start, len(self._power), row, False))
+                if back < np.inf:
+                    heappush(self._power, (back, len(self._power), row, True))
+            return
+        for bus in self.buses:
+            if fault.befalls(bus.spec.name):
+                bus.inject(fault)
+
+    def _switch_power(self, now: float) -> None:
+        while self._power and self._power[0][0] <= now + TOLERANCE:
+            _, _, row, on = heappop(self._power)
+            self.motors.power(row, on, now)
+            if not on:
+                for bus in self.buses:
+                    if row in bus.rows.values():
+                        bus.forget(row)
+
+    def push(self, velocity_delta: Sequence[float]) -> None:
+        """Change the base's velocity at once; (3,) m/s in the world."""
+        self.plant.push(velocity_delta)
+
+    def hold(self) -> None:
+        """Stop lowering the gantry."""
+        self.plant.gantry.hold()
+
+    def lower(self, rate: float = 0.1) -> None:
+        """Lower the gantry at ``rate`` m/s."""
+        self.plant.gantry.lower(rate)
+
+    def release(self) -> None:
+        """Unhook the gantry."""
+        self.plant.release()
+
+    # -- what happened -----------------------------------------------------------------------------------------------
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 (hex) over all frames and packets carried so far, in their order, with their wire."""
+        return self._sha.hexdigest()
+
+    @property
+    def motor_log(self) -> list[MotorEvent]:
+        """What happened in the motors, in order."""
+        return self.motors.log
+
+    def last_command_times(self) -> dict[str, float]:
+        """By joint, when its motor last heard a command that it obeyed (s; -inf: never)."""
+        return dict(zip(self.motors.joints, self.motors.last_command_time.tolist(), strict=True))
+
+    def counters(self) -> dict[str, dict[str, float]]:
+        """By bus: see wire.Traffic, and ``load``, the share of all time so far that the wire was taken."""
+        return {
+            b.spec.name: asdict(b.traffic) | {"load": b.traffic.busy / self.time if self.time else 0.0}
+            for b in self.buses
+        }
+
+    def truth(self) -> Truth:
+        return self.plant.truth()
+
+
+__all__ = ["KINDS", "Fault", "World", "parse_fault"]
