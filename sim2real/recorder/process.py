@@ -60,10 +60,11 @@ class Sink:
     def fileno(self) -> int:
         return self._channel.fileno()
 
-    def close(self) -> None:
-        """Say how much was dropped last, and let go. Never raises."""
-        for topic, dropped in enumerate(self.dropped):
-            with contextlib.suppress(OSError):
+    def close(self, timeout: float = 1.0) -> None:
+        """Say how much was dropped last, and let go. Waits up to ``timeout`` seconds for room to say it; never raises."""
+        with contextlib.suppress(OSError):
+            self._channel.settimeout(timeout)
+            for topic, dropped in enumerate(self.dropped):
                 self._channel.sendmsg((ENVELOPE.pack(self._id, topic, dropped, 0, 0.0),))
         self._channel.close()
 
@@ -126,7 +127,7 @@ class Recorder:
         """Take in what was sent, finish the file and end the process. Returns the ending: ``written`` and ``dropped``
         (topic -> records) and ``stopped`` (why recording stopped early, or ""). Raises Sim2realError where the file is
         not finished after ``timeout`` seconds; then it is left to ``sim2real log repair``."""
-        self.sink.close()
+        self.sink.close(timeout)
         with contextlib.suppress(ProcessLookupError):
             self._process.terminate()  # other holders of the sink may be hung: do not wait for their end of the channel
         try:
