@@ -48,9 +48,17 @@ def calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str]]:
             yield node, dotted(node.func)
 
 
-def imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Every module imported anywhere in the file, also inside functions: (line, dotted name)."""
+def imports(tree: ast.AST, running: bool = False) -> Iterator[tuple[int, str]]:
+    """Every module imported anywhere in the file, also inside functions: (line, dotted name).
+
+    ``running``: leave out what only a type checker sees (``if TYPE_CHECKING:``).
+    """
+    unseen: set[ast.AST] = set()
     for node in ast.walk(tree):
+        if running and isinstance(node, ast.If) and dotted(node.test).endswith("TYPE_CHECKING"):
+            unseen |= {inside for statement in node.body for inside in ast.walk(statement)}
+        if node in unseen:
+            continue
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:

@@ -17,6 +17,7 @@ FACTOR = 8.0  # how many times faster than the incumbent we want to be
 
 
 def rows() -> Iterator[Row]:
+    """The whole wiring of the G1 in one call each way, checked first to agree with the reference."""
     reference = load(ROOT / "tests" / "drivers" / "reference_mit.py")
     motors = tuple(m for bus in load_robot("g1").wiring("can").bus_specs() for m in bus.motors)
     ranges = ranges_of(motors)

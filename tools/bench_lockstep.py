@@ -14,6 +14,7 @@ TURNS = 3
 
 
 def rows() -> Iterator[Row]:
+    """The best of a few turns: other programs only ever make it slower."""
     walk = [
         "--policy",
         adopted(),

@@ -28,12 +28,14 @@ CPU = max(os.sched_getaffinity(0))  # where the loops are pinned
 
 
 def rows() -> Iterator[Row]:
+    """Every combination of load and tuning."""
     for load in ("quiet", "all cores busy"):
         for tuned in (True, False):
             yield from measure(load, tuned)
 
 
 def measure(load: str, tuned: bool) -> Iterator[Row]:
+    """Ours and the floor in turns, under one load."""
     ours: dict[str, list[np.ndarray]] = {topic: [] for topic in RATES}
     floor: dict[str, list[np.ndarray]] = {topic: [] for topic in RATES}
     summaries = []

@@ -14,6 +14,7 @@ FACTOR = 1.3  # how much slower than the bare call we may be
 
 
 def rows() -> Iterator[Row]:
+    """Every policy shipped, and an adopted one."""
     for path in [*sorted(ROOT.glob("policies/*/*.onnx")), adopted()]:
         yield overhead(load_policy(path))
 

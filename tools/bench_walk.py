@@ -20,6 +20,7 @@ CONDITIONS = {"": [], ", 10 % of frames dropped": ["--fault", "drop:0.1"]}
 
 
 def rows() -> Iterator[Row]:
+    """Every seed, on a clean bus and on a lossy one."""
     policy = adopted()
     recorded = json.loads((SOURCE / "result.json").read_text())["runs"]["forward_0.5"]["mean_vx_body_after2s"]
     walk = ["--policy", policy, "--skill", "walk", "--velocity", 0.5, 0, 0, "--duration", 20, "--clock", "lockstep"]
