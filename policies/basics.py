@@ -1,0 +1,92 @@
+"""The policy `basics`: its motions, its network and the settings that trained it. Everything to tune is in this file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from policies.references import Motion
+
+
+def both(joint: str, left: float, mirrored: bool = False) -> dict[str, float]:
+    """The same angle on the left and on the right; ``mirrored`` for roll and yaw, whose signs differ."""
+    return {f"left_{joint}_joint": left, f"right_{joint}_joint": -left if mirrored else left}
+
+
+# Angles are rad from the robot's home pose. The squat keeps the sum of hip, knee and ankle, so the feet stay flat and
+# the pelvis level; arms and waist bring the centre of mass to 6 cm before the ankles (5 cm at home, of 12 to the toes).
+MOTIONS: dict[str, Motion] = {
+    "stand": Motion("Stand at the home pose", period=2.0),
+    "squat": Motion(
+        "Squat and rise, every 4 s",
+        period=4.0,
+        lift={
+            **both("hip_pitch", -0.75),
+            **both("knee", 1.3),
+            **both("ankle_pitch", -0.55),
+            **both("shoulder_pitch", -1.1),
+            **both("elbow", 0.6),
+            "waist_pitch_joint": 0.12,
+        },
+    ),
+    "raise_arms": Motion(
+        "Raise both arms overhead and lower them, every 4 s",
+        period=4.0,
+        lift={**both("shoulder_pitch", -2.6), **both("shoulder_roll", 0.45, mirrored=True), **both("elbow", 0.85)},
+    ),
+    "wave": Motion(
+        "Wave with the right hand",
+        period=1.2,
+        hold={"right_shoulder_roll_joint": -1.5, "right_shoulder_yaw_joint": -1.5, "right_elbow_joint": -0.45},
+        swing={"right_elbow_joint": 0.55},
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Basics:
+    """Settings of one training run; written beside its checkpoints."""
+
+    robot: str = "g1"
+    seed: int = 1
+    envs: int = 512
+    threads: int = 1  # of the physics; the networks have one more
+    # the policy
+    period: float = 0.02  # s
+    hidden: tuple[int, ...] = (256, 128)
+    action_ratio: float = 0.25  # action 1 moves the target by this share of torque / kp
+    action_max: float = 6.0
+    reference_rate: float = 2.5  # rad/s, the fastest a reference moves
+    reference_pull: float = 8.0  # 1/s, how eagerly it moves towards its goal
+    position_margin: float = 0.05  # rad inside the mechanical range; wider than the safety gate's
+    # the world
+    timestep: float = 0.005  # s of the physics
+    episode: float = 10.0  # s
+    switch: tuple[float, float] = (1.5, 5.0)  # s between skill switches
+    push: tuple[float, float] = (1.5, 4.0)  # s between pushes
+    push_speed: tuple[float, float] = (0.2, 0.8)  # m/s, the largest at curriculum level 0 and 1
+    push_turn: float = 0.6  # rad/s per m/s of push
+    home_start: float = 0.2  # share of episodes that start at home instead of inside a motion
+    # the learner
+    horizon: int = 24  # ticks per iteration
+    learning_rate: tuple[float, float] = (5e-4, 1e-4)  # from, to; annealed over the run
+    samples: float = 12e6
+    normalise_until: float = 0.5e6  # samples after which the observation normaliser is frozen
+    gamma: float = 0.98
+    ppo: dict[str, float | int | str | bool] = field(
+        default_factory=lambda: {
+            "num_learning_epochs": 5,
+            "num_mini_batches": 6,
+            "clip_param": 0.2,
+            "lam": 0.95,
+            "value_loss_coef": 1.0,
+            "entropy_coef": 0.002,
+            "max_grad_norm": 1.0,
+            "schedule": "fixed",
+            "use_clipped_value_loss": False,
+        }
+    )
+    std: float = 0.35  # of the actions at the start
+    # checkpoints and evaluation, in iterations
+    save_every: int = 100
+    evaluate_every: int = 50
+    evaluate_envs: int = 64

@@ -1,0 +1,158 @@
+"""The policy graph: signals in, joint targets out. Training steps through its parts; the exporter traces it whole."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from policies.basics import MOTIONS, Basics
+from policies.observations import Signals, observe
+from policies.references import References
+from sim2real.config import RobotConfig, load_robot
+
+
+class PolicyGraph(nn.Module):
+    """Residual actions on a reference pose.
+
+    ``target = clip(reference + scale * clip(action))``, with the reference from the skill's formula, the action from the
+    actor. ``actor`` and ``critic`` map a raw observation (N, size) to actions (N, n) and a value (N, 1); without them
+    the graph still observes and makes targets, which is all that the training environment needs of it.
+    """
+
+    scale: Tensor
+    lower: Tensor
+    upper: Tensor
+    value_healthy: Tensor
+
+    def __init__(self, config: Basics, robot: RobotConfig | None = None) -> None:
+        super().__init__()
+        robot = robot or load_robot(config.robot)
+        self.config = config
+        self.joint_names = robot.joint_names
+        self.labels = tuple(MOTIONS)
+        self.kp, self.kd = robot.home_kp, robot.home_kd  # (n,)
+        self.references = References(
+            robot.joint_names,
+            robot.home_pos.tolist(),
+            MOTIONS,
+            config.period,
+            config.reference_rate,
+            config.reference_pull,
+        )
+        margin = config.position_margin
+        self.register_buffer("scale", _buffer(config.action_ratio * robot.torque_max / robot.home_kp))
+        self.register_buffer("lower", _buffer(robot.position_min + margin))
+        self.register_buffer("upper", _buffer(robot.position_max - margin))
+        self.register_buffer("value_healthy", torch.ones(len(self.labels)))
+        self.actor: nn.Module = nn.Identity()
+        self.critic: nn.Module = nn.Identity()
+
+    @property
+    def home(self) -> Tensor:
+        return self.references.home
+
+    def target(self, reference: Tensor, action: Tensor) -> Tensor:
+        """Joint targets (N, n) rad."""
+        return torch.minimum(torch.maximum(reference + self.scale * action, self.lower), self.upper)
+
+    def clip(self, action: Tensor) -> Tensor:
+        return torch.clamp(action, -self.config.action_max, self.config.action_max)
+
+    def carry_start(self) -> dict[str, list[float]]:
+        """What each carried tensor is before the first tick; an empty list is zeros."""
+        return {
+            "carry_phase": [],
+            "carry_skill": [],
+            "carry_reference": self.home.tolist(),
+            "carry_action": [],
+        }
+
+    def inputs(self) -> dict[str, list[int]]:
+        """Every input by name with its shape, without the batch axis, in the order of ``forward``."""
+        n, labels = len(self.joint_names), len(self.labels)
+        return {
+            "joint_pos": [n],
+            "joint_vel": [n],
+            "orientation_base_in_world": [4],
+            "angular_velocity_base_in_base": [3],
+            "skill": [labels],
+            "carry_phase": [1],
+            "carry_skill": [labels],
+            "carry_reference": [n],
+            "carry_action": [n],
+        }
+
+    def outputs(self) -> dict[str, list[int]]:
+        """Every output by name with its shape, without the batch axis, in the order of ``forward``."""
+        n, labels = len(self.joint_names), len(self.labels)
+        size = 3 + 3 + 3 * n + labels + 2 + n
+        return {
+            "joint_pos_target": [n],
+            "carry_phase_next": [1],
+            "carry_skill_next": [labels],
+            "carry_reference_next": [n],
+            "carry_action_next": [n],
+            "observation": [size],
+            "action": [n],
+            "skill_value": [labels],
+        }
+
+    def forward(
+        self,
+        joint_pos: Tensor,
+        joint_vel: Tensor,
+        orientation_base_in_world: Tensor,
+        angular_velocity_base_in_base: Tensor,
+        skill: Tensor,
+        carry_phase: Tensor,
+        carry_skill: Tensor,
+        carry_reference: Tensor,
+        carry_action: Tensor,
+    ) -> tuple[Tensor, ...]:
+        """One tick of a batch of one. Returns the tensors of ``outputs()`` in that order.
+
+        All labels are computed at once, row k as if label k were asked for now; the asked one drives the joints, all of
+        them give ``skill_value``: the critic's value over that of an undisturbed episode, so 1 is healthy.
+        """
+        every = torch.eye(len(self.labels))
+        rows = lambda x: x.expand(len(self.labels), -1)  # noqa: E731
+        phases, references = self.references.advance(every, rows(carry_skill), rows(carry_phase), rows(carry_reference))
+        observations = observe(
+            Signals(
+                rows(joint_pos),
+                rows(joint_vel),
+                rows(orientation_base_in_world),
+                rows(angular_velocity_base_in_base),
+                every,
+                self.home,
+                phases,
+                references,
+                rows(carry_action),
+            )
+        )
+        observation = skill @ observations
+        reference = skill @ references
+        action = self.clip(self.actor(observation))
+        value = (self.critic(observations).T / self.value_healthy).reshape(1, -1)
+        return (
+            self.target(reference, action),
+            skill @ phases,
+            skill + 0.0,
+            reference,
+            action,
+            observation,
+            action + 0.0,
+            value,
+        )
+
+
+def one_hot(labels: Sequence[int] | np.ndarray, size: int) -> Tensor:
+    """(N,) label indices -> (N, size) float32."""
+    return torch.eye(size)[torch.as_tensor(np.asarray(labels), dtype=torch.long)]
+
+
+def _buffer(values: np.ndarray) -> Tensor:
+    return torch.tensor(values, dtype=torch.float32)

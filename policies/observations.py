@@ -1,0 +1,46 @@
+"""What the network sees: one function per term, used by the training environment and inside the exported graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Signals(NamedTuple):
+    """All that an observation may be made of, each (N, size): the contract's inputs, and the state carried along."""
+
+    joint_pos: Tensor  # rad
+    joint_vel: Tensor  # rad/s
+    orientation_base_in_world: Tensor  # w, x, y, z
+    angular_velocity_base_in_base: Tensor  # rad/s
+    skill: Tensor  # one-hot
+    home: Tensor  # (n,) rad
+    phase: Tensor  # (N, 1) in [0, 1)
+    reference: Tensor  # rad
+    last_action: Tensor
+
+
+def gravity_in_base(orientation_base_in_world: Tensor) -> Tensor:
+    """Unit vector of gravity (N, 3) in the base: R(q)^T (0, 0, -1); upright is (0, 0, -1)."""
+    w, x, y, z = orientation_base_in_world.unbind(-1)
+    return torch.stack([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1], dim=-1)
+
+
+TERMS: dict[str, Callable[[Signals], Tensor]] = {
+    "gravity_in_base": lambda s: gravity_in_base(s.orientation_base_in_world),
+    "angular_velocity_base_in_base": lambda s: s.angular_velocity_base_in_base,
+    "joint_pos": lambda s: s.joint_pos - s.home,
+    "joint_vel": lambda s: s.joint_vel,
+    "last_action": lambda s: s.last_action,
+    "skill": lambda s: s.skill,
+    "phase": lambda s: torch.cat([torch.sin(2 * torch.pi * s.phase), torch.cos(2 * torch.pi * s.phase)], dim=-1),
+    "reference": lambda s: s.reference - s.home,
+}
+
+
+def observe(signals: Signals) -> Tensor:
+    """The observation (N, size): every term of TERMS, in that order. Scaling is the network's normaliser."""
+    return torch.cat([term(signals) for term in TERMS.values()], dim=-1)

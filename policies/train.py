@@ -1,0 +1,207 @@
+"""PPO (rsl_rl) on the training environment: resumable, self-evaluating, keeping the checkpoint that survives best."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+from rsl_rl.algorithms import PPO
+from torch import nn
+
+from policies.basics import Basics
+from policies.env import Env
+from policies.evaluate import quick_survival
+from policies.graph import PolicyGraph
+from sim2real.types import Sim2realError
+
+Report = Callable[[dict[str, float]], None]
+
+
+class Training:
+    """One run in ``folder``: ``config.json``, ``curve.jsonl``, ``last.pt`` (resumes) and ``best.pt`` (survives best).
+
+    Under torchrun every process simulates ``config.envs`` robots of its own and the gradients are averaged (gloo).
+    """
+
+    def __init__(self, config: Basics, folder: Path) -> None:
+        self.config, self.folder = config, folder
+        self.rank, self.world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+        torch.set_num_threads(1)
+        torch.manual_seed(config.seed + self.rank)
+        if self.world > 1:
+            torch.distributed.init_process_group("gloo")
+        self.env = Env(config, config.seed + 1000 * self.rank)
+        self.ppo = make_ppo(config, self.env, self.rank, self.world)
+        if self.world > 1:
+            self.ppo.broadcast_parameters()
+        self.iteration, self.best = 0, -1.0
+
+    @property
+    def samples(self) -> int:
+        return self.iteration * self.per_iteration
+
+    @property
+    def per_iteration(self) -> int:
+        return self.config.horizon * self.env.num_envs * self.world
+
+    def run(self, report: Report = lambda row: None) -> None:
+        """Until ``config.samples`` have been seen. ``report(row)`` after each iteration."""
+        if self.rank == 0:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / "config.json").write_text(json.dumps(self._provenance(), indent=1))
+        while self.samples < self.config.samples:
+            row = self.step()
+            if self.iteration % self.config.evaluate_every == 0 and self.rank == 0:
+                row |= quick_survival(self.config, self.graph())
+                score = (row["survival"] + row["survival_pushed"]) / 2
+                if score >= self.best:
+                    self.best = score
+                    self._save("best.pt")
+            if self.iteration % self.config.save_every == 0:
+                if self.rank == 0:
+                    self._save("last.pt")
+                self.env.reset()  # what a resumed run does too, so both continue alike
+            if self.rank == 0:
+                with (self.folder / "curve.jsonl").open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+                report(row)
+
+    def step(self) -> dict[str, float]:
+        """One iteration: collect ``horizon`` ticks, update. Returns a row of the curve."""
+        config, ppo, env = self.config, self.ppo, self.env
+        first, last = config.learning_rate
+        ppo.learning_rate = first + (last - first) * min(1.0, self.samples / config.samples)
+        for group in ppo.optimizer.param_groups:
+            group["lr"] = ppo.learning_rate
+        ppo.train_mode()
+        total, survived, fell = 0.0, 0, 0
+        with torch.no_grad():
+            observations = env.get_observations()
+            for _ in range(config.horizon):
+                observations, rewards, dones, extras = env.step(ppo.act(observations))
+                # Scaled so that the value of an undisturbed state is about 1.
+                ppo.process_env_step(observations, (1 - config.gamma) * rewards, dones, extras)
+                total += float(rewards.mean())
+                survived += int(extras["time_outs"].sum())
+                fell += int(env.failures.sum())
+            ppo.compute_returns(observations)
+        losses = ppo.update()
+        self.iteration += 1
+        return {
+            "iteration": self.iteration,
+            "samples": self.samples,
+            "reward": total / config.horizon,
+            "fell": fell,
+            "survived": survived,
+            "level": env.level or 0.0,
+            "std": float(ppo.actor.output_std.detach().mean()),
+            "learning_rate": ppo.learning_rate,
+            **{f"loss_{k}": float(v) for k, v in losses.items()},
+        }
+
+    def graph(self) -> PolicyGraph:
+        """The policy graph with the networks as they are now."""
+        graph = PolicyGraph(self.config)
+        graph.actor, graph.critic = networks(self.ppo)
+        return graph.eval()
+
+    def resume(self) -> bool:
+        """Continue from ``last.pt`` if there is one; then everything goes on as if it had never stopped."""
+        path = self.folder / "last.pt"
+        if not path.is_file():
+            return False
+        state = torch.load(path, weights_only=True)
+        self.ppo.load(state["ppo"], None, strict=True)
+        self.iteration, self.best = state["iteration"], state["best"]
+        self.env.load_state_dict(state["env"])
+        torch.set_rng_state(state["torch_rng"])
+        return True
+
+    def _save(self, name: str) -> None:
+        state = {
+            "ppo": self.ppo.save(),
+            "iteration": self.iteration,
+            "best": self.best,
+            "env": self.env.state_dict(),
+            "torch_rng": torch.get_rng_state(),
+        }
+        torch.save(state, self.folder / f"{name}.part")
+        os.replace(self.folder / f"{name}.part", self.folder / name)
+
+    def _provenance(self) -> dict:
+        tools = ("mujoco", "torch", "rsl-rl-lib", "numpy")
+        return {
+            "config": dataclasses.asdict(self.config),
+            "world": self.world,
+            "revision": git_revision(),
+            "tools": {name: version(name) for name in tools},
+        }
+
+
+def make_ppo(config: Basics, env: Env, rank: int = 0, world: int = 1) -> PPO:
+    """rsl_rl's PPO with one observation for actor and critic (the exported critic sees what the actor sees)."""
+    network = {"class_name": "MLPModel", "hidden_dims": list(config.hidden), "activation": "elu",
+               "obs_normalization": True}  # fmt: skip
+    settings = {
+        "num_steps_per_env": config.horizon,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "actor": {
+            **network,
+            "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": config.std, "std_type": "scalar"},
+        },
+        "critic": dict(network),
+        "algorithm": {
+            "class_name": "PPO",
+            "gamma": config.gamma,
+            "learning_rate": config.learning_rate[0],
+            **config.ppo,
+        },
+        "multi_gpu": {"global_rank": rank, "local_rank": rank, "world_size": world} if world > 1 else None,
+    }
+    with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
+        ppo: PPO = PPO.construct_algorithm(env.get_observations(), env, settings, "cpu")
+    for model in (ppo.actor, ppo.critic):
+        model.obs_normalizer.until = config.normalise_until
+    with torch.no_grad():
+        last = [m for m in ppo.actor.mlp if isinstance(m, nn.Linear)][-1]
+        last.weight.mul_(0.01)  # start at the reference pose
+        last.bias.zero_()
+    return ppo
+
+
+def networks(ppo: PPO) -> tuple[nn.Module, nn.Module]:
+    """Actor and critic as plain modules: normaliser, then the network's mean."""
+    return tuple(nn.Sequential(m.obs_normalizer, m.mlp) for m in (ppo.actor, ppo.critic))  # type: ignore[return-value]
+
+
+def load_graph(folder: Path, name: str = "best.pt") -> PolicyGraph:
+    """The policy graph of a finished or running training. Raises Sim2realError."""
+    if not (folder / name).is_file():
+        raise Sim2realError(f"{folder / name}: no such checkpoint; train first: sim2real train g1-basics")
+    config = load_config(folder)
+    training = Training(dataclasses.replace(config, envs=1), folder)
+    training.ppo.load(torch.load(folder / name, weights_only=True)["ppo"], {"actor": True, "critic": True}, strict=True)
+    return training.graph()
+
+
+def load_config(folder: Path) -> Basics:
+    """The settings written beside a run's checkpoints."""
+    document = json.loads((folder / "config.json").read_text())["config"]
+    return Basics(**{k: tuple(v) if isinstance(v, list) else v for k, v in document.items()})
+
+
+def git_revision() -> str:
+    """The commit of the working tree, with ``+`` if it has changes; empty outside a repository."""
+    root = Path(__file__).resolve().parents[1]
+    run = lambda *a: subprocess.run(["git", *a], cwd=root, capture_output=True, text=True).stdout.strip()  # noqa: E731
+    with contextlib.suppress(OSError):
+        return run("rev-parse", "HEAD") + ("+" if run("status", "--porcelain", "--", "policies", "configs") else "")
+    return ""
