@@ -11,6 +11,7 @@ from sim2real.safety.limits import Limits
 from sim2real.types import JointCommand, RobotState
 
 GRAVITY = 9.80665  # m/s^2
+FARTHEST = 1e3  # rad: no joint is this far from where it was
 FINITE = float(np.finfo(float).max)  # the greatest number that is one
 SAME_SAMPLE = 1e-6  # s: receive times nearer than this are one and the same IMU sample
 
@@ -18,15 +19,15 @@ SAME_SAMPLE = 1e-6  # s: receive times nearer than this are one and the same IMU
 class Evidence:
     """Filled by ``see`` and ``hear``; arrays are copies, so nobody changes them while they are judged.
 
-    Whatever does not have one number per joint is taken as NaN, and NaN passes no rule.
+    Whatever does not have one number per joint is taken as NaN, and NaN passes no rule. An age below zero is as suspect
+    as one above: a reading from the future would stay fresh for ever.
     """
 
     def __init__(self, limits: Limits):
         n = len(limits.joint_names)
         self.limits = limits
-        self.now = -math.inf  # s, clock time of this tick
-        self.gap = math.inf  # s since the tick before
-        self.armed_since = -math.inf  # s
+        self.now = math.nan  # s, clock time of this tick
+        self.armed_since = math.nan  # s
         self.holding_since = math.inf  # s; inf: not holding
         self._joints = np.full((6, n), np.nan)
         self.measured, self.joint_vel, self.temperature, self.error, self.enabled, self.joint_age = self._joints
@@ -37,31 +38,30 @@ class Evidence:
         self.enabled_at = np.full(n, -math.inf)  # s, when each motor last said that it is enabled
         self.imu = np.full(10, np.nan)
         self._imu_parts = self.imu[:4], self.imu[4:7], self.imu[7:]
-        self.imu_age = math.inf  # s
-        self._imu_sampled = -math.inf
+        self._imu_sampled = math.inf  # s
         self._gyro = b""
-        self.gyro_repeats = 0  # fresh samples in a row with the same bits
+        self.gyro_repeats = math.nan  # fresh samples in a row with the same bits
         self.request = np.zeros((5, n))  # the newest command: position, velocity, torque, kp, kd
         self.command_time = -math.inf  # s, when it was decided
 
     def see(self, state: RobotState, now: float) -> None:
         """Take in a state. One that is not of this moment makes every reading in it that much older."""
         now = float(now)
-        self.gap, self.now = now - self.now, now
+        self.gap, self.now = now - self.now, now  # s since the tick before
         late = abs(now - state.time)
         _fill(
             self._joints,
             (state.joint_pos, state.joint_vel, state.joint_temperature, state.joint_error, state.joint_enabled,
              state.joint_age),
         )  # fmt: skip
-        self.joint_age += late
+        np.add(np.abs(self.joint_age), late, out=self.joint_age)
         self._track_jumps(now)
         np.copyto(self.enabled_at, now, where=self.enabled > 0)
         _fill(
             self._imu_parts,
             (state.orientation_base_in_world, state.angular_velocity_base_in_base, state.acceleration_base_in_base),
         )
-        self.imu_age = state.imu_age + late
+        self.imu_age = abs(state.imu_age) + late
         self._track_gyro(state.time - state.imu_age)
 
     def hear(self, command: JointCommand | None) -> None:
@@ -71,7 +71,7 @@ class Evidence:
             _fill(self.request, (command.joint_pos, command.joint_vel, command.joint_torque, command.kp, command.kd))
 
     def _track_jumps(self, now: float) -> None:
-        reach = np.minimum(self._fastest * (now - self._sampled), FINITE)
+        reach = np.minimum(self._fastest * (now - self._sampled), FARTHEST)
         real = np.abs(self.measured - self.joint_pos) <= reach
         self.jump_ticks += 1
         np.copyto(self.jump_ticks, 0, where=real)
@@ -79,7 +79,7 @@ class Evidence:
         np.subtract(now, self.joint_age, out=self._sampled, where=real)
 
     def _track_gyro(self, sampled: float) -> None:
-        if sampled - self._imu_sampled > SAME_SAMPLE:
+        if abs(sampled - self._imu_sampled) > SAME_SAMPLE:
             gyro = self._imu_parts[1].tobytes()
             self.gyro_repeats = self.gyro_repeats + 1 if gyro == self._gyro else 1
             self._gyro, self._imu_sampled = gyro, sampled

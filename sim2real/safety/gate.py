@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -49,7 +50,7 @@ class Safety:
             row[:] = rule.limit(limits)
         self._present: dict[int, Fault] = {}  # rule number -> what breaks it now
         t = self._limiter.targets
-        self._command = JointCommand(-np.inf, t[POSITION], t[VELOCITY], t[TORQUE], t[KP], t[KD])
+        self._command = JointCommand(math.nan, t[POSITION], t[VELOCITY], t[TORQUE], t[KP], t[KD])
 
     def arm(self, state: RobotState, now: float) -> str | None:
         """Go to RUN from where the robot stands, or say what forbids it. While armed: nothing to do.
@@ -66,7 +67,7 @@ class Safety:
             if self._forbids_arming(fault.rule):
                 return self.explain(fault, self.limits.joint_names)
         self.mode, self.fault = Mode.RUN, None
-        evidence.armed_since, evidence.holding_since = evidence.now, np.inf
+        evidence.armed_since, evidence.holding_since = evidence.now, math.inf
         self._limiter.damp(evidence.joint_pos)
         return None
 
@@ -90,7 +91,7 @@ class Safety:
         with np.errstate(all="ignore"):
             evidence.see(state, now)
             evidence.hear(command)
-            self._climb(self._broken(ARMED if self.mode <= Mode.HOLD else DISARMED))
+            self._judge(ARMED if self.mode <= Mode.HOLD else DISARMED)
             self.limited = 0
             if self.mode == Mode.OFF:
                 limiter.rest()
@@ -124,26 +125,28 @@ class Safety:
         for row, rule in zip(self._rows, asked, strict=False):
             row[:] = rule.value(evidence)
         kept = self._values[: len(asked)] <= self._limits[: len(asked)]
-        broken = dict.fromkeys(np.nonzero(~kept)[0].tolist())  # rows, each once
-        return [self._fault(i, kept[i]) for i in broken]
+        whole = np.logical_and.reduce(kept, axis=1).tolist()
+        return [self._fault(i, kept[i]) for i, every in enumerate(whole) if not every]
 
     def _fault(self, i: int, kept: np.ndarray) -> Fault:
         rule, worst = RULES[i], int(kept.argmin())
         joint = worst if np.ndim(rule.value(self._evidence)) else -1
         return Fault(rule, joint, float(self._values[i, worst]), float(self._limits[i, worst]), self._evidence.now)
 
-    def _climb(self, faults: list[Fault]) -> None:
-        """Tell what began and ended, and take the ladder to the gravest reaction asked for."""
+    def _judge(self, asked: Sequence[Rule]) -> None:
+        """Tell what began and ended, and take the ladder to the gravest reaction that a broken rule asks for."""
+        faults = self._broken(asked)
         present = {fault.rule.number: fault for fault in faults}
         began = [fault for number, fault in present.items() if number not in self._present]
-        ended = [fault._replace(over=True) for number, fault in self._present.items() if number not in present]
-        self._present, self.events = present, (*began, *ended)
+        over = [f._replace(over=True) for f in self._present.values() if f.rule.number not in present]
+        self.events = (*began, *(fault for fault in over if fault.rule in asked))
+        self._present = present
         if self.mode > Mode.HOLD:
             return
         gravest = max(faults, key=lambda fault: fault.rule.reaction, default=None)
-        mode = gravest.rule.reaction if gravest else Mode.RUN
-        if mode == Mode.RUN:
-            self.fault, self._evidence.holding_since = None, np.inf
-        elif self.mode == Mode.RUN:
+        if gravest is None or gravest.rule.reaction == Mode.RUN:
+            self.mode, self.fault, self._evidence.holding_since = Mode.RUN, None, math.inf
+            return
+        if self.mode == Mode.RUN:
             self.fault, self._evidence.holding_since = gravest, self._evidence.now
-        self.mode = mode
+        self.mode = gravest.rule.reaction

@@ -141,7 +141,7 @@ class Limiter:
         self._inside(POSITION)
         predicted = np.abs(kp * (target - position) + offset)
         targets[TORQUE:] *= torque / np.maximum(predicted, torque)
-        return np.count_nonzero(np.logical_or.reduce(targets != request))
+        return int(np.count_nonzero(np.logical_or.reduce(targets != request)))
 
     def _inside(self, rows: int | slice) -> None:
         _clip(self.targets[rows], self.low[rows], self.high[rows])

@@ -1,4 +1,4 @@
-"""The table of rules. ``python -m sim2real.safety.rules`` prints it as it stands in SAFETY.md.
+"""The table of rules. ``python -m sim2real.safety`` prints it as it stands in SAFETY.md.
 
 A fault rule is a row: a value from the evidence, and the limit that it must not exceed. NaN exceeds every limit.
 To add one, add a row; the tests fail until it has its boundary cases.
@@ -7,7 +7,6 @@ To add one, add a row; the tests fail until it has its boundary cases.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
@@ -29,8 +28,7 @@ class When(Enum):
     ARM = "to arm"  # stricter, of a robot that does not move yet
 
 
-@dataclass(frozen=True, eq=False)
-class Rule:
+class Rule(NamedTuple):
     """``value`` of the evidence must be at most ``limit`` of the limits: floats, or (n,) where it is of each joint."""
 
     number: int
@@ -179,7 +177,3 @@ def markdown() -> str:
     lines += ["", "| id | limit | what is done to every command | source |", "|---|---|---|---|"]
     lines += [f"| {c.id} | `{c.name}` | {c.description} | {c.source} |" for c in CLAMPS]
     return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    print(markdown())
