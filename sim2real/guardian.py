@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from drivers.budget import typical_frame_bits
+from drivers.budget import budget
 from drivers.bus import BusError
 from drivers.wire import WireError
 from sim2real.channel import Channel
@@ -87,7 +87,8 @@ class Guardian:
         self._arm_seen = False
         self._ending: float | None = None
         self._told_fault: object = None
-        self._bits = np.array([typical_frame_bits(bus.spec.protocol) / bus.spec.bitrate for bus in robot.buses])
+        budgets = [budget(bus.spec, 1.0 / period) for bus in robot.buses]
+        self._load = np.array([b.load / b.frames for b in budgets])  # of the wire, a frame per tick
         self._frames = np.zeros(len(robot.buses))
         self._tick = 0
 
@@ -204,7 +205,7 @@ class Guardian:
             r["bus.sent"][0, i], r["bus.received"][0, i] = counters.sent, counters.received
             r["bus.rejected"][0, i], r["bus.lost"][0, i] = counters.rejected, counters.lost
         frames = (r["bus.sent"] + r["bus.received"])[0]
-        r["bus.load"][0] = (frames - self._frames) * self._bits / self.period
+        r["bus.load"][0] = (frames - self._frames) * self._load if self._tick else 0.0  # not what connecting took
         self._frames = frames
         self.states.write(r)
         if self.sink is not None:

@@ -143,6 +143,7 @@ class Launch:
         self.since = -1.0
         self._inherit = [inherit] if inherit >= 0 else []
         self._over = threading.Event()
+        self._standing_by = self.clock.now()
 
     @property
     def stage(self) -> Stage:
@@ -171,8 +172,6 @@ class Launch:
 
             self._child("world", "sim2real.world").ready(20.0)
             self.world = WorldRemote(self.directory / "world.sock")
-            if self.gantry:
-                self.world.gantry.hold()
         guardian = self._child("guardian", "sim2real.guardian")
         pilot = self._child("pilot", "sim2real.pilot")
         guardian.ready(20.0)
@@ -206,7 +205,7 @@ class Launch:
             self._wishes.write(self._wish)
             if self.world is not None:
                 if self.gantry:
-                    support(self.world.gantry, self.stage, self.player.gain_time, self._engaged(now), self.since)
+                    support(self.world, self.stage, self._engage_left(now), self.since)
                 self.measures.observe(self.world, self.states.record, self.pilot_states.record, self.since)
             self.measures.tick(self.states.record)
             self._listen()
@@ -216,10 +215,10 @@ class Launch:
         self._listen()
         self.show(self)
 
-    def _engaged(self, now: float) -> float:
+    def _engage_left(self, now: float) -> float:
         if self.stage == Stage.STANDBY:
-            self._engaging = now
-        return now - getattr(self, "_engaging", now)
+            self._standing_by = now
+        return self._standing_by + self.player.engage_time - now
 
     def _listen(self) -> None:
         for name, child in self.children.items():

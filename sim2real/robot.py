@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from drivers.open import open_bus, open_imu
 
+from drivers.budget import check
 from drivers.bus import Clock, Imu, ImuState, MotorBus, MotorCommand, MotorState
 from sim2real.config import RobotConfig, Wiring
 from sim2real.types import JointCommand, RobotState
@@ -141,9 +142,11 @@ def open_robot(
     """Open the buses and the IMU of ``wiring``.
 
     ``wires`` (bus name or "imu" -> wire) replaces the real ones; ``simulated_in`` is the directory of a simulated world's
-    sockets, one per bus.
+    sockets, one per bus. Raises BusError for a wiring that cannot make its rate.
     """
     wires = wires or {}
+    for spec in wiring.bus_specs():
+        check(spec, wiring.rate)
     buses, imu = wiring.bus_specs(), wiring.imu_spec()
     if simulated_in is not None:
         buses = [replace(b, interface="sim", channel=f"{simulated_in}/{b.name}.sock") for b in buses]

@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from drivers.sim.world import World
 from sim2real.channel import Channel
 from sim2real.clock import Schedule, SimClock
@@ -26,6 +24,12 @@ from sim2real.skills import Runnable, SkillPlayer, Stage
 from sim2real.summary import Measures, Summary
 
 
+SETTLE = 3.0  # s: a limp robot on its gantry swings for a while before anybody switches it on
+
+LOWERING = 0.55  # s at 0.1 m/s: feet touch, and the rope still carries about half of the weight
+LETTING_GO = 0.3  # s after the policy took over
+
+
 @dataclass
 class Scene:
     """What a simulation is besides the robot: randomness, faults, and what happens to the body.
@@ -35,12 +39,12 @@ class Scene:
     """
 
     seed: int = 0
-    faults: Sequence[object] = ()
+    faults: Sequence[str] = ()
     prepare: Callable | None = None
     pushes: Sequence[tuple[float, tuple[float, float, float]]] = ()
     gantry: bool = True
+    noise: float = 0.02  # rad, uniform, on the joints it starts from
     timestep: float = 0.002  # s
-    visuals: str = ""  # MJCF with meshes to merge for rendering
 
 
 @dataclass
@@ -70,7 +74,9 @@ class Simulation:
             seed=scene.seed,
             faults=scene.faults,
             prepare=scene.prepare,
-            joint_pos=dict(zip(self.config.joint_names, player.start_posture(), strict=True)),
+            joint_pos=dict(zip(self.config.joint_names, self.config.home_pos, strict=True)),
+            hang=0.02 if scene.gantry else None,
+            noise=scene.noise,
         )
         self.clock = SimClock(self.world.advance, lambda: self.world.time)
         joints = self.config.joint_names
@@ -101,9 +107,8 @@ class Simulation:
 
     def run(self) -> Summary:
         """Connect, arm, perform the operator's timeline, damp, switch off. Raises BusError if a motor is missing."""
-        world, gantry = self.world, self.world.plant.gantry
-        if self.scene.gantry:
-            gantry.hold()
+        world = self.world
+        world.advance(SETTLE)
         self.robot.connect(self.clock)
         self.schedule.start()
         began = self.clock.now()
@@ -117,9 +122,9 @@ class Simulation:
                 running = now
             self.since = now - running if running is not None else -1.0
             if self.scene.gantry:
-                support(gantry, stage, self.player.gain_time, self.player.engaged_for(now), self.since)
+                support(world, stage, self.player.engage_left(now), self.since)
             while pushes and 0 <= pushes[0][0] <= self.since:
-                world.plant.push(np.asarray(pushes.pop(0)[1]))
+                world.push(pushes.pop(0)[1])
             store(self.operator.read(now, self.since), self.player.labels, self._operator_record)
             self._operator_channel.write(self._operator_record)
             self.guardian.tick(due, self.schedule.lateness, self.schedule.late)
@@ -130,18 +135,21 @@ class Simulation:
             if self.each_tick is not None:
                 self.each_tick(self)
             if running is None and now - began > self.timeout:
+                running = now
                 self._tell(f"the policy never took over within {self.timeout:g} s")
                 self.guardian.quit()
-        summary = self.measures.summary(self.messages, self.player, wire_sha256=world.sha256())
+        summary = self.measures.summary(self.messages, self.player, wire_sha256=world.digest)
         self.robot.close()
         self.operator.close()
         return summary
 
 
-def support(gantry, stage: Stage, gain_time: float, engaged: float, since: float) -> None:
-    """What the person at the crane does: holds until the gains are up (``engaged`` s into the soft start), sets the robot
-    down, and lets go once the policy has it (``since`` s)."""
-    if stage == Stage.ENGAGE and gantry.holding and engaged > gain_time:
-        gantry.lower()
-    elif since > 0.4:
-        gantry.release()
+def support(crane, stage: Stage, left: float, since: float) -> None:
+    """What the person at the crane does: in the last of the soft start (``left`` s) sets the robot on its feet without
+    giving it all its weight, and lets go once the policy has had it for a moment (``since`` s)."""
+    if stage == Stage.ENGAGE and left < LOWERING:
+        crane.lower()
+    elif since > LETTING_GO:
+        crane.release()
+    elif since >= 0:
+        crane.hold()

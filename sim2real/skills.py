@@ -100,9 +100,9 @@ class SkillPlayer:
         """Length of the soft start, s."""
         return self.gain_time + self.move_time
 
-    def engaged_for(self, now: float) -> float:
-        """Seconds since the soft start began."""
-        return now - self._engaged
+    def engage_left(self, now: float) -> float:
+        """Seconds until the soft start ends."""
+        return self._engaged + self.engage_time - now
 
     def start_posture(self) -> np.ndarray:
         """(n,) rad: where the soft start ends."""

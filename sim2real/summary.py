@@ -87,13 +87,13 @@ class Measures:
             joint = int(r["fault_joint"][0])
             self._faults.append(f"S2R-{fault:03d}" + (f" {self._config.joint_names[joint]}" if joint >= 0 else ""))
         self._fault = fault
-        self._last = {"ticks": int(r["tick"][0]) + 1, "late": int(r["late"][0]), "lost": int(r["bus.lost"].sum())}
+        self._last |= {"ticks": int(r["tick"][0]) + 1, "late": int(r["late"][0]), "lost": int(r["bus.lost"].sum())}
 
     def observe(self, world: Any, tick: np.ndarray, pilot: np.ndarray, since: float) -> None:
         self._last["policy_ticks"], self._last["policy_late"] = int(pilot["tick"][0]) + 1, int(pilot["late"][0])
         if since < 0 or tick["mode"][0] not in (Mode.RUN, Mode.HOLD):
             return
-        truth = world.plant.truth()
+        truth = world.truth()
         self._seen_body = True
         self._since = since
         yaw = yaw_of(truth.orientation_base_in_world)
@@ -103,7 +103,7 @@ class Measures:
         if truth.fallen and self._fell_at is None:
             self._fell_at = since
         if since >= self.settled:
-            v, c, s = truth.linear_velocity_base_in_world, np.cos(yaw), np.sin(yaw)
+            v, c, s = truth.velocity_base_in_world, np.cos(yaw), np.sin(yaw)
             self._sum += (c * v[0] + s * v[1], c * v[1] - s * v[0], truth.angular_velocity_base_in_base[2])
             self._count += 1
 

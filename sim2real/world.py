@@ -11,8 +11,8 @@ from sim2real.run import Life, RunSpec, tell
 def main(directory: Path) -> int:
     """Serve the world of the run in ``directory`` until the launcher goes."""
     from drivers.sim.serve import serve
-    from drivers.sim.wire import parse_faults
     from drivers.sim.world import World
+    from sim2real.simulation import SETTLE
 
     life = Life()
     spec = RunSpec.load(directory)
@@ -23,9 +23,10 @@ def main(directory: Path) -> int:
         wiring.bus_specs(),
         wiring.imu_spec(),
         seed=spec.seed,
-        faults=parse_faults(spec.faults),
+        faults=spec.faults,
         joint_pos=dict(zip(config.joint_names, config.home_pos, strict=True)),
     )
+    world.advance(SETTLE)
     serve(world, directory, ready=lambda: tell("ready", ready=True), goes_on=life.goes_on, warn=tell)
     return 0
 

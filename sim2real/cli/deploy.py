@@ -181,7 +181,6 @@ def _revision() -> str:
 
 
 def _lockstep(args, config, player, policies, paths, operator, record, console):
-    from drivers.sim.wire import parse_faults
     from sim2real.recorder.process import Direct
     from sim2real.simulation import Scene, Simulation
 
@@ -201,7 +200,7 @@ def _lockstep(args, config, player, policies, paths, operator, record, console):
         config,
         policies,
         operator,
-        Scene(seed=args.seed, faults=parse_faults(args.fault)),
+        Scene(seed=args.seed, faults=args.fault),
         args.wiring,
         sink_for if record else None,
         (lambda run: camera.see(run.world.plant)) if camera else None,

@@ -20,16 +20,19 @@ class Step:
 class ScriptOperator:
     """Arms, performs ``steps`` one after another, then quits."""
 
+    ask_every = 0.5  # s between two requests to be armed
+
     def __init__(self, steps: Sequence[Step]):
         self.steps = list(steps)
         self.duration = sum(s.duration for s in steps)
 
     def read(self, now: float, since: float) -> OperatorInput:
-        left = max(0.0, since)
+        if since < 0:  # ask again and again until the gate agrees; once performing, never: a fault is a person's to clear
+            return OperatorInput(now, self.steps[0].skill, arm=now % self.ask_every < self.ask_every / 2)
         for step in self.steps:
-            if left < step.duration:
-                return OperatorInput(now, step.skill, step.velocity, arm=True)
-            left -= step.duration
+            if since < step.duration:
+                return OperatorInput(now, step.skill, step.velocity)
+            since -= step.duration
         return OperatorInput(now, quit=True)
 
     def close(self) -> None:
