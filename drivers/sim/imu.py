@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import random
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,7 @@ from drivers.wire import WireError
 PROTOCOL = "hipnuc"
 BITS_PER_BYTE = 10  # 8N1
 BLOCK = 256  # samples of noise drawn at once
+TEMPERATURE = 40  # deg C it reports
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,10 @@ class SimImu:
         self._generator = np.random.default_rng([seed, 0x1A])
         self._scale = np.repeat([self.noise.orientation / 2, self.noise.angular_velocity, self.noise.acceleration], 3)
         self._mean = np.concatenate([np.zeros(3), self.noise.angular_velocity_bias, self.noise.acceleration_bias])
-        w, x, y, z = spec.orientation_imu_in_base
-        self._mount = None if (w, x, y, z) == (1, 0, 0, 0) else np.array([w, x, y, z]) / math.hypot(w, x, y, z)
+        mount = spec.orientation_imu_in_base
+        norm = math.hypot(*mount)
+        self._mount = None if mount == (1, 0, 0, 0) else tuple(m / norm for m in mount)
+        self._axes = matrix(self._mount or (1, 0, 0, 0))
         self.carried: list[bytes] = []  # packets since the last digest
 
     def sample(self, now: float) -> None:
@@ -66,22 +69,21 @@ class SimImu:
         at = self._samples % BLOCK
         if at == 1 or self._samples == 1:
             self._block = self._generator.standard_normal((BLOCK, 9)) * self._scale + self._mean
-        noise = self._block[at]
-        body = self._body
-        orientation = body.orientation_imu_in_world
+        body, noise = self._body, self._block[at]
+        orientation = body.orientation_imu_in_world.tolist()
         spin, acceleration = body.angular_velocity_imu_in_imu, body.acceleration_imu_in_imu
         if self._mount is not None:
             orientation = multiply(orientation, self._mount)
-            frame = matrix(self._mount)
-            spin, acceleration = frame.T @ spin, frame.T @ acceleration
-        orientation = multiply(orientation, (1.0, noise[0], noise[1], noise[2]))
+            spin, acceleration = self._axes.T @ spin, self._axes.T @ acceleration
+        w, x, y, z = multiply(orientation, (1.0, *noise[:3].tolist()))
+        norm = math.sqrt(w * w + x * x + y * y + z * z)
         packet = hipnuc.pack(
             hipnuc.Hi91(
                 timestamp=now,
-                temperature=40.0,
+                temperature=TEMPERATURE,
                 acceleration=acceleration + noise[6:9],
                 angular_velocity=spin + noise[3:6],
-                orientation=orientation / math.sqrt(float(orientation @ orientation)),
+                orientation=(w / norm, x / norm, y / norm, z / norm),
                 status=0,
             )
         )
@@ -163,21 +165,22 @@ class SimSerialWire:
         self._open = False
 
 
-def multiply(a, b) -> np.ndarray:
+Quaternion = tuple[float, float, float, float]
+
+
+def multiply(a: Sequence[float], b: Sequence[float]) -> Quaternion:
     """Product of two quaternions (w, x, y, z)."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
-    return np.array(
-        [
-            aw * bw - ax * bx - ay * by - az * bz,
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-        ]
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
     )
 
 
-def matrix(q) -> np.ndarray:
+def matrix(q: Sequence[float]) -> np.ndarray:
     """Rotation matrix (3, 3) of a unit quaternion."""
     w, x, y, z = q
     return np.array(

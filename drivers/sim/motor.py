@@ -204,28 +204,27 @@ class SimMotors:
 
     def _answer(self, row: int) -> tuple[int, int, bytes, int]:
         if self._stale:
-            self.refresh(np.zeros(0, FRAME))
+            self.refresh()
         return row, self._keys[row], self._feedback[16 * row : 16 * row + 16], self._bits[row]
 
-    def refresh(self, frames: np.ndarray) -> list[int]:
-        """Bits of ``frames`` (of the host), and, in the same pass over bytes, every motor's feedback of this substep."""
+    def refresh(self, raw: bytes = b"") -> list[int]:
+        """Bits of the host's frames ``raw``, and, in the same pass, every motor's feedback of this substep."""
         if not self._stale:
-            return self._frame_bits(frames).tolist() if len(frames) else []
+            return self._frame_bits(np.frombuffer(raw, FRAME)).tolist() if raw else []
         self._stale = False
-        sign = self._sign
         feedback = self._codec.pack_feedback(
             self.position,
-            sign * self._body.joint_vel,
-            sign * self._body.joint_torque,
+            self._sign * self._body.joint_vel,
+            self._sign * self._body.joint_torque,
             np.where(self.error, self.error, self.enabled),
             self.driver_temperature,
             self.rotor_temperature,
             self._wrap,
         )
         self._feedback = feedback.tobytes()
-        bits = self._frame_bits(np.concatenate([frames, feedback])).tolist()
-        self._bits = bits[len(frames) :]
-        return bits[: len(frames)]
+        bits = self._frame_bits(np.frombuffer(raw + self._feedback, FRAME)).tolist()
+        self._bits = bits[-len(self.specs) :]
+        return bits[: -len(self.specs)]
 
     @property
     def position(self) -> np.ndarray:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import random
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from typing import Protocol
@@ -81,7 +81,7 @@ class SimCan:
     ):
         self.spec, self.index, self.traffic = spec, index, Traffic()
         self.rows = {m.id: first_row + i for i, m in enumerate(spec.motors)}
-        self.sent: list[tuple[float, np.ndarray]] = []  # by the host, not yet timed
+        self.sent: list[tuple[float, bytes]] = []  # by the host, not yet timed: (ready, raw frames)
         self.inbox: deque[tuple[float, bytes]] = deque()  # (arrival at the host, raw frame)
         self.carried: list[bytes] = []  # raw frames since the last ``digest``
         self._motors, self._latency, self._reply_delay, self._room = motors, latency, reply_delay, queue_length
@@ -109,9 +109,9 @@ class SimCan:
                 self._refuse(len(frames), 0)
         if now < self._away_until:
             raise WireError(f"{self.spec.name}: bus off at {now:.3f} s after too many transmit errors")
-        room = max(0, self._room - len(self._queue) - sum(len(f) for _, f in self.sent))
-        if room:
-            self.sent.append((now + self._latency, frames[:room].copy()))
+        room = max(0, self._room - len(self._queue) - sum(len(raw) for _, raw in self.sent) // FRAME.itemsize)
+        if room and len(frames):
+            self.sent.append((now + self._latency, frames[:room].tobytes()))
         if len(frames) > room:
             self._refuse(len(frames), room)
 
@@ -124,18 +124,18 @@ class SimCan:
 
     def recv(self, now: float) -> np.ndarray:
         """Frames (FRAME, (n,)) that have reached the host by ``now``."""
-        inbox, raws = self.inbox, []
+        inbox = self.inbox
+        raws: list[bytes] = []
         while inbox and inbox[0][0] <= now:
             raws.append(inbox.popleft()[1])
         return np.frombuffer(b"".join(raws), FRAME)
 
     # -- the wire ----------------------------------------------------------------------------------------------------
 
-    def take(self, frames: np.ndarray, ready: float, bits: list[int]) -> None:
-        """Timed frames of the host enter its controller's queue."""
-        raw = frames.tobytes()
-        for i, id in enumerate(frames["id"].tolist()):
-            self._queue.append((ready, priority(id), id, raw[16 * i : 16 * i + 16], bits[i], False))
+    def take(self, ready: float, raw: bytes, ids: Iterable[int], bits: Iterable[int]) -> None:
+        """Frames of the host, whose length on the wire is now known, enter its controller's queue."""
+        for i, (id, n) in enumerate(zip(ids, bits, strict=True)):
+            self._queue.append((ready, priority(id), id, raw[16 * i : 16 * i + 16], n, False))
 
     @property
     def busy(self) -> bool:

@@ -29,6 +29,7 @@ from drivers.sim.imu import ImuNoise, SimImu, SimSerialWire
 from drivers.sim.motor import MotorEvent, SimMotors
 from drivers.sim.plant import Plant, Truth
 from drivers.sim.wire import QUEUE_LENGTH, SimCan, SimCanWire
+from drivers.wire import FRAME
 
 if TYPE_CHECKING:
     import mujoco
@@ -121,15 +122,18 @@ class World:
 
     def _price(self) -> None:
         """Give every frame that hosts sent its length on the wire, all in one pass."""
-        sent = [(bus, ready, frames) for bus in self.buses for ready, frames in bus.sent]
+        sent = [(bus, ready, raw) for bus in self.buses for ready, raw in bus.sent]
         if not sent:
             return
-        bits = self.motors.refresh(np.concatenate([frames for _, _, frames in sent]))
+        raws = b"".join([raw for _, _, raw in sent])
+        bits = self.motors.refresh(raws)
+        ids = np.frombuffer(raws, FRAME)["id"].tolist()
         at = 0
-        for bus, ready, frames in sent:
-            bus.take(frames, ready, bits[at : at + len(frames)])
+        for bus, ready, raw in sent:
+            end = at + len(raw) // FRAME.itemsize
+            bus.take(ready, raw, ids[at:end], bits[at:end])
             bus.sent.clear()
-            at += len(frames)
+            at = end
 
     @property
     def busy(self) -> bool:
