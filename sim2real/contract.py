@@ -46,6 +46,10 @@ OUTPUTS: dict[str, Signal] = {
 }
 CARRY = "carry_"  # carry_x is fed back from carry_x_next
 
+# Policy files come from elsewhere: what they say ends up in terminals, file names and web pages.
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
+Text = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f-\x9f]*$", max_length=1000)]
+
 
 class Envelope(Strict):
     """What training saw of one input, per element."""
@@ -82,9 +86,9 @@ class Hold(Strict):
 class Skill(Strict):
     """One label a policy can perform."""
 
-    label: str
-    description: str = ""
-    next: list[str] | None = None  # labels it may be followed by; None: any
+    label: Name
+    description: Text = ""
+    next: list[Name] | None = None  # labels it may be followed by; None: any
     dwell: Unsigned = 0.3  # s, shortest stay
     value_min: float | None = None  # refuse to switch to it while skill_value is below
 
@@ -92,34 +96,34 @@ class Skill(Strict):
 class Provenance(Strict):
     """Where the policy comes from."""
 
-    source: str
-    revision: str = ""
-    licence: str
-    created: str = ""  # date
-    tools: dict[str, str] = {}
-    training: dict[str, str | float | int | bool] = {}
+    source: Text
+    revision: Text = ""
+    licence: Text
+    created: Text = ""  # date
+    tools: dict[Name, Text] = {}
+    training: dict[Name, Text | float | int | bool] = {}
 
 
 class Contract(Strict):
     """All that a policy says about itself. Lists per joint are in ``joint_names`` / ``target_joint_names`` order."""
 
     schema_version: Literal[1] = SCHEMA
-    name: str
-    robot: str
+    name: Name
+    robot: Name
     variants: list[int] = []
     period: Positive  # s
-    joint_names: Annotated[list[str], Field(min_length=1)]  # joints it observes
-    target_joint_names: Annotated[list[str], Field(min_length=1)]  # joints it drives
+    joint_names: Annotated[list[Name], Field(min_length=1)]  # joints it observes
+    target_joint_names: Annotated[list[Name], Field(min_length=1)]  # joints it drives
     default_joint_pos: list[float]  # rad, of joint_names: where it expects to start
     kp: list[Unsigned]  # N m/rad, of target_joint_names, full precision
     kd: list[Unsigned]  # N m s/rad
-    hold: dict[str, Hold] = {}  # joints of the robot that it does not drive
+    hold: dict[Name, Hold] = {}  # joints of the robot that it does not drive
     action_scale: list[float] = []  # for other stacks: already applied inside joint_pos_target
-    inputs: dict[str, list[int]]  # name -> shape without the batch axis
-    outputs: dict[str, list[int]]
-    carry: dict[str, Carry] = {}
+    inputs: dict[Name, list[int]]  # name -> shape without the batch axis
+    outputs: dict[Name, list[int]]
+    carry: dict[Name, Carry] = {}
     skills: Annotated[list[Skill], Field(min_length=1)]
-    default_skill: str
+    default_skill: Name
     command_velocity_min: tuple[float, float, float] = (0.0, 0.0, 0.0)
     command_velocity_max: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quaternion_order: Literal["wxyz"] = "wxyz"
