@@ -24,6 +24,7 @@ class Calls(IntFlag):
     ARM = 1
     STOP = 2
     OFF = 4
+    STOP_AFTER = 8  # stopped behind the step, because a bus failed to take its command
 
 
 class Layout(NamedTuple):
