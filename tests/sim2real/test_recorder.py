@@ -157,7 +157,7 @@ def test_cut_anywhere(record, tmp_path):
         kept.append(reader.records)
     assert kept == sorted(kept)
     assert kept[0] == 0 and kept[-1] == 2400
-    assert len(set(kept)) > 2 * data.count(b"\3\0\0\0lz4")  # also parts of a chunk, not whole chunks only
+    assert len(set(kept)) > 20  # of the last of 7 chunks, too, what is whole
 
 
 def test_repair_of_a_cut_file_is_a_whole_file(record, tmp_path):
