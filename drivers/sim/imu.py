@@ -83,7 +83,7 @@ class SimImu:
                 temperature=TEMPERATURE,
                 acceleration=acceleration + noise[6:9],
                 angular_velocity=spin + noise[3:6],
-                orientation=(w / norm, x / norm, y / norm, z / norm),
+                orientation=np.array([w, x, y, z]) / norm,
                 status=0,
             )
         )

@@ -60,9 +60,14 @@ class MotorEvent(NamedTuple):
 class Body(Protocol):
     """What motors drive: see drivers.sim.plant.Plant."""
 
-    joint_pos: np.ndarray
-    joint_vel: np.ndarray
-    joint_torque: np.ndarray
+    @property
+    def joint_pos(self) -> np.ndarray: ...
+
+    @property
+    def joint_vel(self) -> np.ndarray: ...
+
+    @property
+    def joint_torque(self) -> np.ndarray: ...
 
     def drive(self, bias: np.ndarray, kp: np.ndarray, kd: np.ndarray) -> None: ...
 

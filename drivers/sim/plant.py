@@ -12,7 +12,6 @@ with speed, contact compliance other than MuJoCo's.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
@@ -20,21 +19,9 @@ import numpy as np
 
 from drivers.bus import BusError
 from drivers.sim.gantry import Gantry
+from drivers.sim.truth import Truth
 
 IMU_SITE = "sim2real/imu"
-
-
-@dataclass(frozen=True)
-class Truth:
-    """What nobody on the robot can know: the base in the world."""
-
-    time: float  # s
-    position_base_in_world: np.ndarray  # (3,) m
-    orientation_base_in_world: np.ndarray  # (4,) w, x, y, z
-    velocity_base_in_world: np.ndarray  # (3,) m/s
-    angular_velocity_base_in_base: np.ndarray  # (3,) rad/s
-    tilt: float  # rad between the base's up and the world's
-    fallen: bool
 
 
 class Plant:

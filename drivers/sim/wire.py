@@ -30,10 +30,6 @@ QUEUE_LENGTH = 128  # frames; Linux' default of 10 is too small for a tick (set 
 BROADCAST_ID = 0x7FF
 
 
-class Reply(tuple):
-    """(arbitration key, raw frame, bits) of what a motor answers."""
-
-
 class Motors(Protocol):
     """What a wire asks of the motors on it. ``row``: a motor's index over all buses."""
 
@@ -102,13 +98,13 @@ class SimCan:
 
     def send(self, frames: np.ndarray, now: float) -> None:
         """Queue frames (FRAME, (n,)). Raises WireFull, or WireError while the controller is off the bus."""
-        for fault in self._host_faults:
-            if fault.start <= now < fault.end and self._random.random() < fault.probability:
-                if fault.kind == "bus_off":
-                    raise WireError(f"{self.spec.name}: bus off at {now:.3f} s; check cable and termination")
-                self._refuse(len(frames), 0)
-        if now < self._away_until:
-            raise WireError(f"{self.spec.name}: bus off at {now:.3f} s after too many transmit errors")
+        if self._host_faults or now < self._away_until:
+            if self.away(now):
+                raise WireError(f"{self.spec.name}: bus off at {now:.3f} s; check cable and termination")
+            for fault in self._host_faults:
+                if fault.kind == "no_buffer" and fault.start <= now < fault.end:
+                    if self._random.random() < fault.probability:
+                        self._refuse(len(frames), 0)
         room = max(0, self._room - len(self._queue) - sum(len(raw) for _, raw in self.sent) // FRAME.itemsize)
         if room and len(frames):
             self.sent.append((now + self._latency, frames[:room].tobytes()))
@@ -152,7 +148,7 @@ class SimCan:
         queue, waiting, contending, powered = self._queue, self._waiting, self._contending, self._motors.powered
         receive, bus, delay, bit = self._motors.receive, self.index, self._reply_delay, self._bit
         faults = [f for f in self._faults if f[0].start < until and f[0].end > self._free] if self._faults else ()
-        away = self._away(until)
+        away = self.away(until if self.idle else self._free)
         if away or (queue and not any(powered[row] for row in self.rows.values())):
             self._stall(until, away)
             return
@@ -212,12 +208,9 @@ class SimCan:
                 for _ in range(copies):
                     inbox.append((end + latency, raw))
 
-    def _away(self, until: float) -> bool:
-        """Whether the host's controller is off the bus now."""
-        now = self._free if not self.idle else until
-        return now < self._away_until or any(
-            f.kind == "bus_off" and f.start < until and until <= f.end for f in self._host_faults
-        )
+    def away(self, now: float) -> bool:
+        """Whether the host's controller is off the bus."""
+        return now < self._away_until or any(f.kind == "bus_off" and f.start <= now < f.end for f in self._host_faults)
 
     def _stall(self, until: float, away: bool) -> None:
         """Nobody acknowledges (the first frame is sent for ever), or the host is gone (what it had queued is lost)."""

@@ -24,10 +24,11 @@ import numpy as np
 
 from drivers.budget import frame_bits
 from drivers.bus import BusError, BusSpec, ImuSpec
-from drivers.sim.faults import IMU, KINDS, POWER, Fault, parse_fault
+from drivers.sim.faults import IMU, POWER, Fault, parse_fault
 from drivers.sim.imu import ImuNoise, SimImu, SimSerialWire
 from drivers.sim.motor import MotorEvent, SimMotors
-from drivers.sim.plant import Plant, Truth
+from drivers.sim.plant import Plant
+from drivers.sim.truth import Truth
 from drivers.sim.wire import QUEUE_LENGTH, SimCan, SimCanWire
 from drivers.wire import FRAME
 
@@ -94,7 +95,7 @@ class World:
 
     def advance(self, until: float) -> None:
         """Let everything happen up to ``until`` (s). The plant moves in whole substeps; the wires exactly."""
-        end = (self._substeps + 1) * self._timestep
+        end = self.next_substep
         while end <= until + TOLERANCE:
             start = end - self._timestep
             if self._power and self._power[0][0] <= start + TOLERANCE:
@@ -105,7 +106,7 @@ class World:
             self._substeps += 1
             self.time = end
             self.imu.sample(end)
-            end = (self._substeps + 1) * self._timestep
+            end = self.next_substep
         if until > self.time + TOLERANCE:
             self._carry(until)
             self.time = until
@@ -134,6 +135,11 @@ class World:
             bus.take(ready, raw, ids[at:end], bits[at:end])
             bus.sent.clear()
             at = end
+
+    @property
+    def next_substep(self) -> float:
+        """When the plant moves next (s)."""
+        return (self._substeps + 1) * self._timestep
 
     @property
     def busy(self) -> bool:
@@ -219,6 +225,3 @@ class World:
 
     def truth(self) -> Truth:
         return self.plant.truth()
-
-
-__all__ = ["KINDS", "Fault", "World", "parse_fault"]

@@ -1,0 +1,327 @@
+"""A World as a process of its own, in real time, behind unix sockets in a directory.
+
+    <bus>.sock    SEQPACKET, datagrams of FRAME rows, both ways
+    imu.sock      SEQPACKET, the bytes of the serial line
+    world.sock    SEQPACKET, JSON: {"call": "push", "arguments": {...}} -> {"result": ...} or {"error": "..."}
+
+Simulated time follows CLOCK_MONOTONIC on an absolute schedule of substeps. A late substep is caught up; a lag beyond
+LAG_MAX is not: time then slips, is counted, and said (``status``), for a robot that is slower than its clock without a
+word would be a lie. Frames are stamped when they are read, answers leave at the first wake-up after their arrival.
+
+    python -m drivers.sim.serve DIRECTORY [--can BUS=INTERFACE:CHANNEL ...] < spec.json
+
+The second form also puts a bus onto any python-can interface, so that other programs can drive these motors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.bus import BusError, BusSpec, ImuSpec, MotorSpec
+from drivers.sim.socket_wire import BUS_OFF, CONTROLLER, DATAGRAM, RESTARTED, TX_OVERFLOW
+from drivers.sim.wire import SimCan
+from drivers.sim.world import World
+from drivers.wire import ERROR, FRAME, CanWire, WireError, WireFull
+
+LAG_MAX = 0.05  # s of lag that is still caught up
+WAKE = 0.0005  # s between wake-ups while frames are on their way
+EVENTS_PER_CALL = 500
+OPTIONS = frozenset(
+    {"timestep", "seed", "faults", "joint_pos", "hang", "noise", "registers", "wrap", "latency", "reply_delay",
+     "queue_length"}
+)  # fmt: skip
+
+
+@dataclass
+class Pace:
+    """How real the time is."""
+
+    time: float = 0.0  # s, simulated
+    epoch: float = 0.0  # s, CLOCK_MONOTONIC at simulated time 0 (moves when time slips)
+    elapsed: float = 0.0  # s since the start, CLOCK_MONOTONIC
+    factor: float = 1.0  # simulated time per real time
+    lateness_max: float = 0.0  # s, the latest a substep was
+    slipped: float = 0.0  # s given up, because this machine is too slow
+    unread: int = 0  # datagrams that a host did not take
+
+
+class BusPort:
+    """A bus with the hosts on it: sockets that come and go, and possibly a python-can wire."""
+
+    def __init__(self, bus: SimCan, bridge: CanWire | None = None):
+        self.bus, self.bridge = bus, bridge
+        self._away = False
+
+    def take(self, frames: np.ndarray, now: float) -> np.ndarray | None:
+        """Frames from a host; returns the error frame that a SocketCAN controller would report, or None."""
+        try:
+            self.bus.send(frames, now)
+        except WireFull:
+            return error_frame(CONTROLLER, TX_OVERFLOW)
+        except WireError:
+            if not self._away:
+                self._away = True
+                return error_frame(BUS_OFF)
+        return None
+
+    def give(self, now: float) -> bytes:
+        """What has arrived for the hosts, error frames included."""
+        raw = self.bus.recv(now).tobytes()
+        away = self.bus.away(now)
+        if away != self._away:
+            self._away = away
+            raw += error_frame(BUS_OFF if away else RESTARTED).tobytes()
+        return raw
+
+
+def error_frame(kind: int, reason: int = 0) -> np.ndarray:
+    """One FRAME (1,) as linux/can/error.h has it."""
+    frame = np.zeros(1, FRAME)
+    frame["id"], frame["length"] = ERROR | kind, 8
+    frame["data"][0, 1] = reason
+    return frame
+
+
+class Server:
+    """Runs ``world`` in real time until ``stop`` is called, by whom ever."""
+
+    def __init__(self, world: World, directory: Path, bridges: Mapping[str, CanWire] | None = None):
+        self.world, self.pace = world, Pace()
+        bridges = bridges or {}
+        self._ports = {b.spec.name: BusPort(b, bridges.get(b.spec.name)) for b in world.buses}
+        self._listeners: dict[socket.socket, str] = {}
+        self._clients: dict[socket.socket, str] = {}
+        self._stopping = False
+        self._calls: dict[str, Callable[..., Any]] = {
+            "hold": world.hold,
+            "lower": world.lower,
+            "release": world.release,
+            "push": world.push,
+            "inject": world.inject,
+            "truth": world.truth,
+            "digest": lambda: world.digest,
+            "motor_log": lambda start=0: world.motor_log[start : start + EVENTS_PER_CALL],
+            "last_command_times": world.last_command_times,
+            "counters": world.counters,
+            "status": lambda: self.pace,
+            "stop": self.stop,
+        }
+        directory.mkdir(parents=True, exist_ok=True)
+        for name in (*self._ports, "imu", "world"):
+            path = directory / f"{name}.sock"
+            path.unlink(missing_ok=True)
+            listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+            try:
+                listener.bind(str(path))
+            except OSError as error:
+                raise BusError(f"{path}: {error}; expected a path of at most 107 bytes in a writable folder") from None
+            listener.listen()
+            self._listeners[listener] = name
+
+    def stop(self) -> None:
+        """End ``run`` at its next wake-up."""
+        self._stopping = True
+
+    def run(self) -> None:
+        """Serve. The only place that waits."""
+        began = time.monotonic()
+        self.pace.epoch = began - self.world.time
+        parent, parent_seen = os.getppid(), began
+        while not self._stopping:
+            self._wait()
+            real = time.monotonic()
+            self._pace(real, began)
+            self._flush()
+            if real - parent_seen > 1.0:
+                parent_seen = real
+                if os.getppid() != parent:  # whoever started this is gone
+                    break
+        self.close()
+
+    def _wait(self) -> None:
+        """Until somebody has something to say, or the next substep is due, or frames may have arrived."""
+        due = self.world.next_substep
+        if self.world.busy or any(p.bridge for p in self._ports.values()):
+            due = min(due, self.world.time + WAKE)
+        timeout = max(0.0, self.pace.epoch + due - time.monotonic())
+        ready, _, _ = select.select([*self._listeners, *self._clients], [], [], timeout)
+        for sock in ready:
+            if sock in self._listeners:
+                client, _ = sock.accept()
+                client.setblocking(False)
+                self._clients[client] = self._listeners[sock]
+            else:
+                self._hear(sock)
+        for name, port in self._ports.items():
+            if port.bridge is not None and len(frames := port.bridge.recv()):
+                self._take(name, frames)
+
+    def _pace(self, real: float, began: float) -> None:
+        """Move the world on to real time, as far as it can follow."""
+        pace, world = self.pace, self.world
+        now = real - pace.epoch
+        lag = now - world.next_substep
+        if lag > LAG_MAX:
+            if not pace.slipped:
+                print(f"simulated robot: cannot keep up with real time (late by {lag:.3f} s)", file=sys.stderr)
+            pace.slipped += lag
+            pace.epoch += lag
+            now -= lag
+        pace.lateness_max = max(pace.lateness_max, lag)
+        world.advance(now)
+        pace.time, pace.elapsed = world.time, real - began
+        pace.factor = 1.0 - pace.slipped / pace.elapsed if pace.elapsed > 0 else 1.0
+
+    def _hear(self, sock: socket.socket) -> None:
+        name = self._clients[sock]
+        try:
+            data = sock.recv(DATAGRAM)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            del self._clients[sock]
+            sock.close()
+        elif name == "world":
+            self._send(sock, self._call(data))
+        elif name != "imu" and len(data) % FRAME.itemsize == 0:
+            if (error := self._take(name, np.frombuffer(data, FRAME))) is not None:
+                self._send(sock, error.tobytes())
+
+    def _take(self, name: str, frames: np.ndarray) -> np.ndarray | None:
+        return self._ports[name].take(frames, max(self.world.time, time.monotonic() - self.pace.epoch))
+
+    def _flush(self) -> None:
+        """Give the hosts what has arrived."""
+        now = self.world.time + 1e-9
+        out = {"imu": self.world.imu.read(now)}
+        for name, port in self._ports.items():
+            out[name] = port.give(now)
+            if port.bridge is not None and out[name]:
+                frames = np.frombuffer(out[name], FRAME)
+                port.bridge.send(frames[frames["id"] & ERROR == 0])
+        for sock, name in list(self._clients.items()):
+            if data := out.get(name):
+                self._send(sock, data)
+
+    def _send(self, sock: socket.socket, data: bytes) -> None:
+        try:
+            sock.send(data)
+        except BlockingIOError:
+            self.pace.unread += 1
+        except OSError:
+            self._clients.pop(sock, None)
+            sock.close()
+
+    def _call(self, data: bytes) -> bytes:
+        try:
+            request = json.loads(data)
+            name, arguments = request["call"], request.get("arguments", {})
+            if name not in self._calls:
+                raise BusError(f"got call '{name}', expected one of {', '.join(self._calls)}")
+            return json.dumps({"result": _plain(self._calls[name](**arguments))}).encode()
+        except (BusError, KeyError, TypeError, ValueError) as error:
+            return json.dumps({"error": f"{error}" or repr(error)}).encode()
+
+    def close(self) -> None:
+        for sock in (*self._clients, *self._listeners):
+            if sock in self._listeners:
+                Path(sock.getsockname()).unlink(missing_ok=True)
+            sock.close()
+        self._clients.clear()
+        self._listeners.clear()
+        for port in self._ports.values():
+            if port.bridge is not None:
+                port.bridge.close()
+
+
+def world_of(spec: Mapping[str, Any]) -> World:
+    """A World from a JSON-able document: ``model``, ``base``, ``buses`` (as ``asdict(BusSpec)``), ``imu``, and any of
+    OPTIONS. Raises BusError."""
+    needed = {"model", "base", "buses", "imu"}
+    if missing := needed - set(spec):
+        raise BusError(f"world: no {sorted(missing)}, expected {sorted(needed)}")
+    if strangers := set(spec) - needed - OPTIONS - {"can"}:
+        raise BusError(f"world: got {sorted(strangers)}, expected {sorted(needed | OPTIONS | {'can'})}")
+    buses = [BusSpec(**{**b, "motors": tuple(MotorSpec(**m) for m in b["motors"])}) for b in spec["buses"]]
+    imu = dict(spec["imu"])
+    if "orientation_imu_in_base" in imu:
+        imu["orientation_imu_in_base"] = tuple(imu["orientation_imu_in_base"])
+    options = {k: v for k, v in spec.items() if k in OPTIONS}
+    return World(spec["model"], spec["base"], buses, ImuSpec(**imu), **options)
+
+
+def serve(spec: Mapping[str, Any], directory: str | Path, ready: Callable[[], None] | None = None) -> None:
+    """Serve the world of ``spec`` (see ``world_of``) in ``directory`` until it is stopped or its parent is gone.
+
+    ``ready`` is called once, when every socket listens. ``spec["can"]``: {bus: "interface:channel"} of python-can.
+    SIGTERM and SIGINT end it.
+    """
+    world = world_of(spec)
+    bridges = {bus: _bridge(world, bus, channel) for bus, channel in dict(spec.get("can", {})).items()}
+    server = Server(world, Path(directory), bridges)
+    for signum in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(signum, lambda *_: server.stop())
+    if ready is not None:
+        ready()
+    server.run()
+
+
+def _bridge(world: World, bus: str, channel: str) -> CanWire:
+    from drivers.can_wire import PythonCanWire
+
+    if bus not in world.wires:
+        raise BusError(f"--can: got bus '{bus}', expected one of {', '.join(world.wires)}")
+    interface, _, name = channel.partition(":")
+    bitrate = next(b.spec.bitrate for b in world.buses if b.spec.name == bus)
+    return PythonCanWire(interface, name, bitrate)
+
+
+def _plain(value: Any) -> Any:
+    """As JSON can have it: arrays as lists, dataclasses as objects, -inf (never) and NaN as null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return _plain(asdict(value))
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m drivers.sim.serve", description=__doc__.splitlines()[0])
+    parser.add_argument("directory", type=Path)
+    parser.add_argument("--can", action="append", default=[], metavar="BUS=INTERFACE:CHANNEL")
+    arguments = parser.parse_args(argv)
+    spec = json.load(sys.stdin)
+    spec["can"] = dict(spec.get("can", {})) | dict(c.split("=", 1) for c in arguments.can)
+    try:
+        serve(spec, arguments.directory, ready=lambda: print("ready", flush=True))
+    except (BusError, WireError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
