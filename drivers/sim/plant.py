@@ -9,6 +9,9 @@ Not modelled: flexible links, backlash, friction that depends on load or tempera
 with speed, contact compliance other than MuJoCo's.
 """
 
+# MuJoCo ships no types.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import gc
 import json
 import math
 import os
@@ -98,10 +99,16 @@ def error_frame(kind: int, reason: int = 0) -> np.ndarray:
 
 
 class Server:
-    """Runs ``world`` in real time until ``stop`` is called, by whom ever."""
+    """Sockets for ``world`` in ``directory``; ``run`` serves them. ``bridges``: further hosts, by bus."""
 
-    def __init__(self, world: World, directory: Path, bridges: Mapping[str, CanWire] | None = None):
-        self.world, self.pace = world, Pace()
+    def __init__(
+        self,
+        world: World,
+        directory: Path,
+        bridges: Mapping[str, CanWire] | None = None,
+        warn: Callable[[str], object] = lambda text: print(text, file=sys.stderr),
+    ):
+        self.world, self.pace, self._warn = world, Pace(), warn
         bridges = bridges or {}
         self._ports = {b.spec.name: BusPort(b, bridges.get(b.spec.name)) for b in world.buses}
         self._listeners: dict[socket.socket, str] = {}
@@ -137,21 +144,19 @@ class Server:
         """End ``run`` at its next wake-up."""
         self._stopping = True
 
-    def run(self) -> None:
-        """Serve. The only place that waits."""
+    def run(self, goes_on: Callable[[], bool] = lambda: True) -> None:
+        """Serve until somebody calls ``stop``, or ``goes_on()`` says no."""
+        gc.collect()
+        gc.freeze()
         began = time.monotonic()
         self.pace.epoch = began - self.world.time
-        parent, parent_seen = os.getppid(), began
-        while not self._stopping:
-            self._wait()
-            real = time.monotonic()
-            self._pace(real, began)
-            self._flush()
-            if real - parent_seen > 1.0:
-                parent_seen = real
-                if os.getppid() != parent:  # whoever started this is gone
-                    break
-        self.close()
+        try:
+            while not self._stopping and goes_on():
+                self._wait()
+                self._follow(time.monotonic(), began)
+                self._flush()
+        finally:
+            self.close()
 
     def _wait(self) -> None:
         """Until somebody has something to say, or the next substep is due, or frames may have arrived."""
@@ -171,14 +176,14 @@ class Server:
             if port.bridge is not None and len(frames := port.bridge.recv()):
                 self._take(name, frames)
 
-    def _pace(self, real: float, began: float) -> None:
+    def _follow(self, real: float, began: float) -> None:
         """Move the world on to real time, as far as it can follow."""
         pace, world = self.pace, self.world
         now = real - pace.epoch
         lag = now - world.next_substep
         if lag > LAG_MAX:
             if not pace.slipped:
-                print(f"simulated robot: cannot keep up with real time (late by {lag:.3f} s)", file=sys.stderr)
+                self._warn(f"the simulated robot cannot keep up with real time: {lag:.3f} s late, its clock slips")
             pace.slipped += lag
             pace.epoch += lag
             now -= lag
@@ -257,8 +262,8 @@ def world_of(spec: Mapping[str, Any]) -> World:
     needed = {"model", "base", "buses", "imu"}
     if missing := needed - set(spec):
         raise BusError(f"world: no {sorted(missing)}, expected {sorted(needed)}")
-    if strangers := set(spec) - needed - OPTIONS - {"can"}:
-        raise BusError(f"world: got {sorted(strangers)}, expected {sorted(needed | OPTIONS | {'can'})}")
+    if strangers := set(spec) - needed - OPTIONS:
+        raise BusError(f"world: got {sorted(strangers)}, expected {sorted(needed | OPTIONS)}")
     buses = [BusSpec(**{**b, "motors": tuple(MotorSpec(**m) for m in b["motors"])}) for b in spec["buses"]]
     imu = dict(spec["imu"])
     if "orientation_imu_in_base" in imu:
@@ -267,20 +272,25 @@ def world_of(spec: Mapping[str, Any]) -> World:
     return World(spec["model"], spec["base"], buses, ImuSpec(**imu), **options)
 
 
-def serve(spec: Mapping[str, Any], directory: str | Path, ready: Callable[[], None] | None = None) -> None:
-    """Serve the world of ``spec`` (see ``world_of``) in ``directory`` until it is stopped or its parent is gone.
+def serve(
+    world: World,
+    directory: str | Path,
+    *,
+    ready: Callable[[], object] = lambda: None,
+    goes_on: Callable[[], bool] = lambda: True,
+    warn: Callable[[str], object] = lambda text: print(text, file=sys.stderr),
+    can: Mapping[str, str] | None = None,
+) -> Pace:
+    """Serve ``world`` in ``directory`` while ``goes_on()``, or until a ``stop`` over its socket.
 
-    ``ready`` is called once, when every socket listens. ``spec["can"]``: {bus: "interface:channel"} of python-can.
-    SIGTERM and SIGINT end it.
+    ``ready`` is called once, when every socket listens; ``warn`` when the machine is too slow. ``can``: buses to put on
+    python-can as well, {bus: "interface:channel"}. Returns how real the time was. Raises BusError, WireError.
     """
-    world = world_of(spec)
-    bridges = {bus: _bridge(world, bus, channel) for bus, channel in dict(spec.get("can", {})).items()}
-    server = Server(world, Path(directory), bridges)
-    for signum in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(signum, lambda *_: server.stop())
-    if ready is not None:
-        ready()
-    server.run()
+    bridges = {bus: _bridge(world, bus, channel) for bus, channel in (can or {}).items()}
+    server = Server(world, Path(directory), bridges, warn)
+    ready()
+    server.run(goes_on)
+    return server.pace
 
 
 def _bridge(world: World, bus: str, channel: str) -> CanWire:
@@ -309,17 +319,26 @@ def _plain(value: Any) -> Any:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m drivers.sim.serve", description=__doc__.splitlines()[0])
+    """Serve the world described on standard input until SIGTERM, SIGINT, or the end of the process that started this."""
+    parser = argparse.ArgumentParser(prog="python -m drivers.sim.serve", description=main.__doc__)
     parser.add_argument("directory", type=Path)
     parser.add_argument("--can", action="append", default=[], metavar="BUS=INTERFACE:CHANNEL")
     arguments = parser.parse_args(argv)
-    spec = json.load(sys.stdin)
-    spec["can"] = dict(spec.get("can", {})) | dict(c.split("=", 1) for c in arguments.can)
+    parent, signals = os.getppid(), []
+    for signum in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(signum, lambda number, _: signals.append(number))
     try:
-        serve(spec, arguments.directory, ready=lambda: print("ready", flush=True))
+        pace = serve(
+            world_of(json.load(sys.stdin)),
+            arguments.directory,
+            ready=lambda: print("ready", flush=True),
+            goes_on=lambda: not signals and os.getppid() == parent,
+            can=dict(c.split("=", 1) for c in arguments.can),
+        )
     except (BusError, WireError) as error:
         print(error, file=sys.stderr)
         return 2
+    print(json.dumps(_plain(pace)))
     return 0
 
 

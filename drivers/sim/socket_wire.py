@@ -167,7 +167,7 @@ class WorldRemote:
         self.call("inject", fault=fault)
 
     def truth(self) -> Truth:
-        fields = self.call("truth")
+        fields: dict[str, Any] = self.call("truth")
         return Truth(**{k: np.array(v) if isinstance(v, list) else v for k, v in fields.items()})
 
     @property

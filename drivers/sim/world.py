@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from heapq import heappop, heappush
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -31,9 +31,6 @@ from drivers.sim.plant import Plant
 from drivers.sim.truth import Truth
 from drivers.sim.wire import QUEUE_LENGTH, SimCan, SimCanWire
 from drivers.wire import FRAME
-
-if TYPE_CHECKING:
-    import mujoco
 
 TOLERANCE = 1e-9  # s: what a caller's arithmetic may be off by
 
@@ -56,7 +53,7 @@ class World:
         timestep: float = 0.002,
         seed: int = 0,
         faults: Sequence[Fault | str] = (),
-        prepare: Callable[[mujoco.MjSpec], None] | None = None,
+        prepare: Callable[[Any], None] | None = None,
         joint_pos: Mapping[str, float] | None = None,
         hang: float | None = 0.01,
         noise: float = 0.0,
