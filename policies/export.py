@@ -14,6 +14,7 @@ import logging
 import math
 import os
 import tempfile
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -24,7 +25,7 @@ from pydantic import ValidationError
 from sim2real.config import RobotConfig, explain, load_robot
 from sim2real.contract import CARRY, METADATA_KEY, Contract
 from sim2real.graph import seal
-from sim2real.policy import Policy, PolicyError, load_policy
+from sim2real.policy import Policy, PolicyError, load_policy, refuse_mismatches
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -59,7 +60,7 @@ def pack(model: ModelProto, contract: Contract, path: str | Path, robot: RobotCo
 def numbers(values: Any) -> Any:
     """Nested lists of the shortest decimals that read back as the same float32 values."""
     array = np.asarray(values, np.float32)
-    return [numbers(v) for v in array] if array.ndim else float(f"{array:.9g}")
+    return [numbers(v) for v in array] if array.ndim else float(str(array[()]))
 
 
 def golden(inputs: Mapping[str, np.ndarray], outputs: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -143,7 +144,9 @@ def export(
         },
         str(path),
     )
-    return pack(_trace(module), contract, path)
+    robot = load_robot(contract.robot)
+    refuse_mismatches(contract, robot, str(path))  # before the slow part
+    return pack(_trace(module), contract, path, robot)
 
 
 def rollout(module: Exportable, sequence: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -172,16 +175,18 @@ def _trace(module: Exportable) -> ModelProto:
 
     assert isinstance(module, torch.nn.Module)
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision, which nobody asked for
-    program = torch.onnx.export(
-        module.eval().cpu(),
-        tuple(torch.zeros(1, *shape) for shape in module.inputs().values()),
-        input_names=list(module.inputs()),
-        output_names=list(module.outputs()),
-        opset_version=OPSET,
-        dynamo=True,
-        external_data=False,
-        verbose=False,
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # about torch's own calls
+        program = torch.onnx.export(
+            module.eval().cpu(),
+            tuple(torch.zeros(1, *shape) for shape in module.inputs().values()),
+            input_names=list(module.inputs()),
+            output_names=list(module.outputs()),
+            opset_version=OPSET,
+            dynamo=True,
+            external_data=False,
+            verbose=False,
+        )
     assert program is not None
     model = program.model_proto
     model.ir_version = IR_VERSION

@@ -23,7 +23,7 @@ from sim2real.config import RobotConfig, did_you_mean, explain
 from sim2real.contract import CARRY, METADATA_KEY, Contract
 from sim2real.graph import PolicyError, metadata, parse, tensors
 
-__all__ = ["Mismatch", "Policy", "PolicyError", "load_policy", "mismatches", "read_contract"]
+__all__ = ["Mismatch", "Policy", "PolicyError", "load_policy", "mismatches", "read_contract", "refuse_mismatches"]
 
 TRIAL_SECONDS = 20.0  # a policy needs well below one, most of it the start of Python
 TRIAL_BYTES = 8 * 2**30  # of address space, of which onnxruntime reserves much and touches little
@@ -151,9 +151,8 @@ def load_policy(
     if sha256 and sha256.lower() != digest:
         raise PolicyError(f"{path}: got sha256 {digest}, expected {sha256}; it is another file, or was changed")
     contract = _read_contract(data, str(path))
-    if robot is not None and (found := mismatches(contract, robot)):
-        lines = "\n".join(f"  {m}" for m in found)
-        raise PolicyError(f"{path}: policy '{contract.name}' does not fit robot '{robot.name}':\n{lines}")
+    if robot is not None:
+        refuse_mismatches(contract, robot, str(path))
     if trial:
         _try(data, path, trial)
     policy = Policy(data, contract, path)
@@ -255,6 +254,13 @@ def mismatches(contract: Contract, robot: RobotConfig) -> list[Mismatch]:
     # With foreign joint names the checks by joint have nothing to compare with.
     checks = CHECKS if not strangers else (_identity, _period)
     return [*strangers, *(m for check in checks for m in check(contract, robot))]
+
+
+def refuse_mismatches(contract: Contract, robot: RobotConfig, where: str) -> None:
+    """Raise PolicyError with every mismatch, if there is one."""
+    if found := mismatches(contract, robot):
+        lines = "\n".join(f"  {m}" for m in found)
+        raise PolicyError(f"{where}: policy '{contract.name}' does not fit robot '{robot.name}':\n{lines}")
 
 
 def _strangers(contract: Contract, robot: RobotConfig) -> Iterator[Mismatch]:
