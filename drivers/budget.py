@@ -64,7 +64,7 @@ def check(spec: BusSpec, rate: float) -> Budget:
     if b.load_worst > 1.0:
         raise BusError(
             f"bus {spec.name}: {len(spec.motors)} motors at {rate:g} Hz need {b.load_worst:.0%} of {spec.bitrate} bit/s "
-            f"in the worst case, expected at most 100 %.\n  Lower the rate (at most {b.rate_max:.0f} Hz is sensible), or "
+            f"in the worst case, expected at most 100%.\n  Lower the rate (at most {b.rate_max:.0f} Hz is sensible), or "
             "move motors to another bus"
         )
     return b

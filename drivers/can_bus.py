@@ -135,8 +135,8 @@ class CanBus:
                 raise BusError(
                     f"bus {self.spec.name} ({self._where()}): the transmit queue is full; got no acknowledgement, "
                     f"expected frames to leave within {0 if required else QUEUE_FULL_TIME:g} s.\n"
-                    "  Check motor power, wiring, termination and bit rate; `ip -s link` shows bus-off; "
-                    f"then connect again ({error})"
+                    "  Check motor power, wiring, termination and bit rate (`ip -s link` shows bus-off), and that the "
+                    f"queue holds a tick (`ip link set ... txqueuelen 100`); then connect again ({error})"
                 ) from error
         except WireError as error:
             raise BusError(f"bus {self.spec.name} ({self._where()}): {error}") from error

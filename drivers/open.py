@@ -76,9 +76,7 @@ def _open_can(spec: BusSpec, where: str) -> Any:
         return load("drivers.sim.socket_wire:SocketCanWire")(spec.channel)
     if spec.interface == "socketcan":
         return load("drivers.can_wire:RawCanWire").open(spec.channel)
-    import can
-
-    _known("interface", spec.interface, ("sim", *sorted(can.VALID_INTERFACES)), where)
+    _known("interface", spec.interface, ["sim", *load("drivers.can_wire:interfaces")()], where)
     return load("drivers.can_wire:PythonCanWire")(spec.interface, spec.channel, spec.bitrate)
 
 

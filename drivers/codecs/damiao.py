@@ -105,6 +105,12 @@ class Operation(IntEnum):
     REFRESH = 0xCC  # answered with feedback
 
 
+# By the third and fourth byte: may this be an answer on the register channel?
+IS_ANSWER, IS_REGISTER = np.zeros((2, 256), bool)
+IS_ANSWER[[Operation.READ, Operation.WRITE]] = True
+IS_REGISTER[list(REGISTER_NAMES)] = True
+
+
 class Kind(IntEnum):
     """What a frame from the host is, for a motor."""
 
@@ -281,11 +287,6 @@ class DamiaoCodec:
 
     def error_name(self, code: int) -> str:
         return ERRORS.get(code, f"unknown status {code:#x}") if code else "none"
-
-
-IS_ANSWER, IS_REGISTER = np.zeros((2, 256), bool)
-IS_ANSWER[[Operation.READ, Operation.WRITE]] = True
-IS_REGISTER[list(REGISTER_NAMES)] = True
 
 
 def _checks(spec: BusSpec, ranges: Ranges) -> list[RegisterCheck]:

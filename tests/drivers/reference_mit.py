@@ -5,7 +5,7 @@ from __future__ import annotations
 
 def encode(value: float, low: float, high: float, bits: int) -> int:
     value = min(max(value, low), high)
-    return int((value - low) * ((1 << bits) - 1) / (high - low))
+    return int((value - low) * ((1 << bits) - 1) / (high - low) + 1e-6)  # full scale must not fall below by rounding
 
 
 def decode(code: int, low: float, high: float, bits: int) -> float:

@@ -1,0 +1,350 @@
+"""CanBus against scripted Damiao motors on a fake wire and a fake clock: connecting, refusing, counting, stopping."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scripted_can import ScriptedMotors, leg
+
+from drivers.bus import BusError, MotorCommand
+from drivers.can_bus import ANSWER_TIME, QUEUE_FULL_TIME, TRIES, CanBus
+from drivers.codecs.damiao import Kind
+from drivers.open import open_bus
+from drivers.wire import ERROR, WireError, WireFull
+
+
+class FakeClock:
+    def __init__(self) -> None:
+        self.time = 100.0
+
+    def now(self) -> float:
+        return self.time
+
+    def sleep_until(self, time: float) -> None:
+        self.time = max(self.time, time)
+
+
+def made(n: int = 3, connect: bool = True, **changes) -> tuple[CanBus, ScriptedMotors, FakeClock]:
+    spec = leg(n, **changes)
+    wire, clock = ScriptedMotors(spec), FakeClock()
+    bus = open_bus(spec, wire)
+    assert isinstance(bus, CanBus)
+    if connect:
+        bus.connect(clock)
+        wire.sent.clear()
+    return bus, wire, clock
+
+
+def command(n: int = 3, **changes) -> MotorCommand:
+    zero = {name: np.zeros(n) for name in MotorCommand.__slots__}
+    return MotorCommand(**(zero | changes))
+
+
+def kinds(wire: ScriptedMotors) -> list[int]:
+    return [int(k) for frames in wire.sent for k in wire.codec.classify(frames)[1]]
+
+
+def refuse(error: Exception):
+    def send(frames: np.ndarray) -> None:
+        raise error
+
+    return send
+
+
+# Connecting
+
+
+def test_connect_disables_checks_and_programs_the_watchdog():
+    bus, wire, clock = made(connect=False, watchdog=0.12)
+    wire.status[:] = 1  # left enabled by whoever was here before
+    bus.connect(clock)
+    assert kinds(wire)[:3] == [Kind.DISABLE] * 3
+    assert Kind.ENABLE not in kinds(wire) and Kind.COMMAND not in kinds(wire)
+    assert [r["TIMEOUT"] for r in wire.registers] == [2400] * 3  # 0.12 s in 50 us ticks
+    state = bus.read(clock.now())
+    assert not state.enabled.any() and np.isfinite(state.position).all()
+    assert clock.now() - 100 < 0.02
+    assert bus.counters.rejected == 0
+
+
+def test_connect_is_refused_naming_every_register_that_differs():
+    bus, wire, clock = made(connect=False)
+    wire.registers[0]["VMAX"] = 30.0
+    wire.registers[2]["VMAX"] = 20.0
+    with pytest.raises(BusError) as refused:
+        bus.connect(clock)
+    lines = str(refused.value).splitlines()
+    assert lines[0] == "bus leg, motor of joint_1 (id 0x1, DM8009): register VMAX is 30, expected 45"
+    assert lines[1] == "bus leg, motor of joint_3 (id 0x3, DM8009): register VMAX is 20, expected 45"
+    assert "velocities would be scaled wrongly" in lines[2]
+    assert Kind.ENABLE not in kinds(wire)
+
+
+@pytest.mark.parametrize(
+    ("register", "value", "message"),
+    [
+        ("PMAX", 12.566371, "PMAX is 12.5664, expected 12.5"),
+        ("TMAX", 54.01, "TMAX is 54.01, expected 54"),
+        ("CTRL_MODE", 2, r"CTRL_MODE is 2, expected 1\n  set it to 1 \(MIT\)"),
+        ("VMAX", float("nan"), "VMAX is nan, expected 45"),
+    ],
+)
+def test_each_register_is_compared(register, value, message):
+    bus, wire, clock = made(connect=False)
+    wire.registers[1][register] = value
+    wire.codec.pack_register = lambda row, *rest, pack=wire.codec.pack_register: _with_nan(pack, row, *rest)
+    with pytest.raises(BusError, match=message):
+        bus.connect(clock)
+
+
+def _with_nan(pack, row, operation, register, value):
+    if np.isnan(value):
+        frame = pack(row, operation, register, 0.0)
+        frame["data"][0, 4:] = np.array([value], "<f4").view(np.uint8)
+        return frame
+    return pack(row, operation, register, value)
+
+
+def test_a_range_within_the_rounding_of_a_float_is_accepted():
+    bus, wire, clock = made(connect=False)
+    wire.registers[1]["PMAX"] = float(np.float32(12.5) * np.float32(1.00001))
+    bus.connect(clock)
+
+
+def test_a_watchdog_that_does_not_keep_its_value_is_refused():
+    """The answer to the write repeats what was written; only reading it back shows what the motor kept."""
+    bus, wire, clock = made(connect=False)
+
+    class Deaf(dict):
+        def __setitem__(self, name, value):
+            pass
+
+    wire.registers[2] = Deaf(wire.registers[2])
+    answer = wire.codec.pack_register
+    wire.codec.pack_register = lambda row, op, register, value: answer(row, op, register, 1600 if op == 0x55 else value)
+    with pytest.raises(BusError, match=r"joint_3 .*TIMEOUT is 0, expected 1600\n  the motor would not stop by itself"):
+        bus.connect(clock)
+
+
+def test_every_silent_motor_is_named_within_its_time():
+    bus, wire, clock = made(connect=False)
+    wire.silent = {0, 2}
+    with pytest.raises(BusError) as refused:
+        bus.connect(clock)
+    lines = str(refused.value).splitlines()
+    assert "motor of joint_1 (id 0x1): no answer on 0x11 to a request for register PMAX, tried 3 times" in lines[0]
+    assert "joint_3" in lines[1]
+    assert "socketcan can7: Frames from other identifiers: none. Check power" in lines[2]
+    assert clock.now() - 100 <= TRIES * ANSWER_TIME + 1e-6 <= 0.3
+
+
+def test_a_motor_that_answers_elsewhere_is_hinted_at():
+    bus, wire, clock = made(connect=False)
+    wire.codec.feedback_ids[1] = 0x2A
+    with pytest.raises(BusError, match=r"joint_2 .*no answer on 0x12(.|\n)*from other identifiers: 0x2a"):
+        bus.connect(clock)
+
+
+def test_lost_frames_are_asked_again_and_a_connection_stays_below_a_second():
+    bus, wire, clock = made(connect=False)
+    turn = {"n": 0}
+
+    def lose(row: int, kind: int) -> bool:
+        turn["n"] += 1
+        return turn["n"] % 2 == 0
+
+    wire.lose = lose
+    bus.connect(clock)
+    assert clock.now() - 100 < 1.0
+
+
+def test_a_motor_that_stays_enabled_is_refused():
+    bus, wire, clock = made(connect=False)
+    wire.status[1], wire.obey_disable = 1, False
+    with pytest.raises(BusError, match=r"joint_2 \(id 0x2\): enabled, expected disabled"):
+        bus.connect(clock)
+
+
+def test_other_traffic_while_connecting_does_no_harm():
+    bus, wire, clock = made(connect=False)
+    other = wire.feedback()
+    other["id"] += 0x100
+    wire.arrive(np.concatenate([other, wire.codec.pack_register(0, 0x33, "PMAX", 99.0)]))  # from before: thrown away
+    bus.connect(clock)
+
+
+def test_nothing_is_sent_before_connecting():
+    bus, wire, _ = made(connect=False)
+    for act in (bus.poll, bus.enable, lambda: bus.write(command())):
+        with pytest.raises(BusError, match="bus leg: not connected; call connect"):
+            act()
+    assert wire.sent == []
+
+
+# One tick
+
+
+def test_poll_asks_without_commanding():
+    bus, wire, clock = made()
+    wire.position[:] = [0.1, -0.2, 0.3]
+    bus.poll()
+    assert kinds(wire) == [Kind.REGISTER] * 3
+    state = bus.read(5.0)
+    np.testing.assert_allclose(state.position, [0.1, -0.2, 0.3], atol=4e-4)
+    assert state.time.tolist() == [5.0] * 3
+
+
+def test_enable_write_and_disable():
+    bus, wire, clock = made()
+    bus.enable()
+    assert kinds(wire) == [Kind.ENABLE] * 3 and wire.status.tolist() == [1, 1, 1]
+    bus.write(command(position=np.array([0.5, 0.0, -0.5])))
+    assert bus.read(clock.now()).enabled.all()
+    bus.disable()
+    assert kinds(wire)[-3:] == [Kind.DISABLE] * 3 and wire.status.tolist() == [0, 0, 0]
+    bus.poll()
+    assert not bus.read(clock.now()).enabled.any()
+
+
+def test_state_is_kept_with_the_time_of_each_motor():
+    bus, wire, clock = made()
+    bus.poll()
+    bus.read(1.0)
+    wire.silent = {1}
+    bus.poll()
+    state = bus.read(2.0)
+    assert state.time.tolist() == [2.0, 1.0, 2.0]
+    assert bus.read(3.0) is state
+    assert state.time.tolist() == [2.0, 1.0, 2.0]
+
+
+def test_errors_are_named_and_lost_communication_is_cleared_by_polling():
+    bus, wire, clock = made()
+    wire.status[:] = [0xD, 0xB, 0]
+    bus.poll()
+    state = bus.read(1.0)
+    assert [bus.error_name(int(e)) for e in state.error] == ["lost communication", "driver over-temperature", "none"]
+    wire.sent.clear()
+    bus.poll()
+    assert kinds(wire) == [Kind.CLEAR_ERROR, Kind.REGISTER, Kind.REGISTER]
+    bus.poll()
+    assert bus.read(2.0).error.tolist() == [0, 0xB, 0]
+
+
+def test_enabling_clears_what_is_left_of_an_error():
+    bus, wire, clock = made()
+    wire.status[:] = [0, 0xB, 0]
+    bus.poll()
+    bus.read(1.0)
+    wire.sent.clear()
+    bus.enable()
+    assert kinds(wire) == [Kind.CLEAR_ERROR] + [Kind.ENABLE] * 3
+    assert wire.status.tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("quantity", MotorCommand.__slots__)
+def test_a_command_that_is_not_finite_sends_nothing(quantity, value):
+    bus, wire, _ = made()
+    with pytest.raises(ValueError, match=f"{quantity} {value}"):
+        bus.write(command(**{quantity: np.array([0.0, value, 0.0])}))
+    assert wire.sent == []
+
+
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=15, max_size=15))
+def test_no_write_enables_disables_zeroes_or_clears(values):
+    bus, wire, _ = BUS
+    wire.sent.clear()
+    bus.write(MotorCommand(*np.array(values).reshape(5, 3)))
+    assert kinds(wire) == [Kind.COMMAND] * 3
+    assert wire.sent[0]["id"].tolist() == [1, 2, 3]
+
+
+BUS = made()
+
+
+def test_strangers_and_error_frames_are_counted():
+    bus, wire, _ = made()
+    stranger = wire.feedback()[:1]
+    stranger["id"] = 0x77
+    error = stranger.copy()
+    error["id"] = ERROR | 0x40
+    wire.arrive(np.concatenate([stranger, error, wire.feedback()]))
+    before = bus.counters.received
+    bus.read(7.0)
+    assert bus.counters.received - before == 4
+    assert bus.counters.rejected == 1
+    assert bus.counters.extra["bus_errors"] == 1
+
+
+# A wire in trouble
+
+
+def test_a_full_queue_drops_ticks_and_is_an_error_after_a_second():
+    bus, wire, clock = made()
+    wire.refuse = refuse(WireFull("sent 1 of 3 frames: No buffer space available"))
+    clock.time += 0.5
+    bus.write(command())
+    assert bus.counters.lost == 1
+    clock.time += QUEUE_FULL_TIME - 0.51
+    bus.write(command())
+    clock.time += 0.02
+    with pytest.raises(BusError, match=r"leg \(socketcan can7\): the transmit queue is full(.|\n)*Check motor power"):
+        bus.write(command())
+    wire.refuse = lambda frames: None
+    bus.write(command())  # the bus is back
+    wire.refuse = refuse(WireFull("again"))
+    clock.time += 0.5
+    bus.poll()
+    assert bus.counters.lost == 4
+
+
+def test_enabling_half_a_bus_is_an_error():
+    bus, wire, _ = made()
+    wire.refuse = refuse(WireFull("sent 1 of 3 frames"))
+    with pytest.raises(BusError, match="transmit queue is full"):
+        bus.enable()
+
+
+def test_a_wire_that_is_gone_is_a_bus_error():
+    bus, wire, _ = made()
+    wire.refuse = refuse(WireError("Network is down"))
+    for act in (bus.poll, bus.enable, lambda: bus.write(command())):
+        with pytest.raises(BusError, match=r"bus leg \(socketcan can7\): Network is down"):
+            act()
+    wire.recv = refuse_recv
+    with pytest.raises(BusError, match="Network is down"):
+        bus.read(1.0)
+
+
+def refuse_recv() -> np.ndarray:
+    raise WireError("Network is down")
+
+
+@pytest.mark.parametrize("error", [WireFull("full"), WireError("gone"), OSError(19, "No such device")])
+def test_disable_never_raises(error):
+    bus, wire, _ = made()
+    wire.refuse = refuse(error)
+    bus.disable()
+    assert bus.counters.extra["disable_failed"] == 1
+
+
+def test_close_closes_the_wire():
+    bus, wire, _ = made()
+    bus.close()
+    assert wire.closed
+
+
+def test_two_motors_of_different_models_are_scaled_each_by_its_own():
+    spec = leg(2)
+    spec = replace(spec, motors=(replace(spec.motors[0], model="DM10010L"), spec.motors[1]))
+    wire = ScriptedMotors(spec)
+    bus = open_bus(spec, wire)
+    bus.connect(FakeClock())
+    wire.torque[:] = [150.0, 30.0]
+    bus.poll()
+    np.testing.assert_allclose(bus.read(1.0).torque, [150, 30], atol=0.1)
