@@ -71,7 +71,7 @@ class Evidence:
             _fill(self.request, (command.joint_pos, command.joint_vel, command.joint_torque, command.kp, command.kd))
 
     def _track_jumps(self, now: float) -> None:
-        reach = np.minimum(self._fastest * (now - self._sampled), FARTHEST)
+        reach = np.fmin(self._fastest * (now - self._sampled), FARTHEST)  # NaN: after an age that was none
         real = np.abs(self.measured - self.joint_pos) <= reach
         self.jump_ticks += 1
         np.copyto(self.jump_ticks, 0, where=real)
@@ -88,7 +88,7 @@ class Evidence:
 
     def position_overrun(self) -> np.ndarray:
         """How far each joint is beyond its mechanical range, rad; negative: inside."""
-        return np.maximum(self.measured - self.limits.position_max, self.limits.position_min - self.measured)
+        return np.maximum(self.joint_pos - self.limits.position_max, self.limits.position_min - self.joint_pos)
 
     def speed(self) -> np.ndarray:
         return np.abs(self.joint_vel)
