@@ -25,7 +25,7 @@ class Fault(NamedTuple):
     joint: int  # index, -1: of no joint
     value: float  # in ``rule.unit``
     limit: float
-    time: float  # s
+    time: float  # s, when it was found, or found to be over
     over: bool = False
 
 
@@ -138,7 +138,8 @@ class Safety:
         faults = self._broken(asked)
         present = {fault.rule.number: fault for fault in faults}
         began = [fault for number, fault in present.items() if number not in self._present]
-        over = [f._replace(over=True) for f in self._present.values() if f.rule.number not in present]
+        now = self._evidence.now
+        over = [f._replace(over=True, time=now) for f in self._present.values() if f.rule.number not in present]
         self.events = (*began, *(fault for fault in over if fault.rule in asked))
         self._present = present
         if self.mode > Mode.HOLD:
@@ -148,5 +149,5 @@ class Safety:
             self.mode, self.fault, self._evidence.holding_since = Mode.RUN, None, math.inf
             return
         if self.mode == Mode.RUN:
-            self.fault, self._evidence.holding_since = gravest, self._evidence.now
+            self.fault, self._evidence.holding_since = gravest, now
         self.mode = gravest.rule.reaction
