@@ -37,7 +37,7 @@ class Row(NamedTuple):
 def interleaved(
     functions: dict[str, Callable[[], object]], blocks: int = 101, length: float = 4e-3
 ) -> dict[str, float]:
-    """Median seconds per call of each function, in turns of ``length`` seconds, so that all meet the same weather."""
+    """Least seconds per call of each function, of many turns of ``length`` seconds: others only ever make it slower."""
     calls = {}
     for name, function in functions.items():
         function()  # warm
@@ -56,7 +56,7 @@ def interleaved(
                 times[name].append((perf_counter() - start) / n)
     finally:
         gc.enable()
-    return {name: float(np.median(t)) for name, t in times.items()}
+    return {name: min(t) for name, t in times.items()}
 
 
 def quantiles(seconds: np.ndarray) -> list[float]:
