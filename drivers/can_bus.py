@@ -149,10 +149,10 @@ class CanBus:
             frames = self._wire.recv()
         except WireError as error:
             raise BusError(f"bus {self.spec.name} ({self._where()}): {error}") from error
-        error = frames["id"] & ERROR != 0
-        if error.any():
-            self.counters.extra["bus_errors"] += int(np.count_nonzero(error))
-            frames = frames[~error]
+        error = frames["id"] & ERROR
+        if errors := np.count_nonzero(error):
+            self.counters.extra["bus_errors"] += errors
+            frames = frames[error == 0]
         return frames
 
     def _check(self, check: RegisterCheck, clock: Clock) -> None:
