@@ -1,4 +1,4 @@
-"""The guardian: owns the buses; each tick reads, lets the safety gate decide, writes, publishes.
+"""The guardian: owns the buses; each tick reads, publishes, lets the safety gate decide, writes.
 
 It is small on purpose. It knows no policy, no skill and no file; a hung or dead pilot is to it only a command that grows
 old. The one call that moves the robot is in ``Guardian._transmit``.
@@ -60,6 +60,8 @@ class Guardian:
     ``tell`` receives a sentence for the operator whenever something was refused or went wrong.
     """
 
+    response_share = 0.35  # of a tick, between sensing and acting: the pilot's answer goes out in the tick it belongs to,
+    # and the motors' replies are still back before the next
     enable_time = 0.3  # s for every motor to answer that it is enabled
     damp_time = 1.5  # s of damping at the end of a run before the motors are switched off
 
@@ -77,6 +79,7 @@ class Guardian:
     ):
         self.robot, self.safety, self.clock, self.period = robot, safety, clock, period
         self.requests, self.operator, self.states, self.sink, self.tell = requests, operator, states, sink, tell
+        self.response = self.response_share * period
         self.done = False
         self.record = states.layout.new()
         self._state = state_view(self.record)
@@ -93,17 +96,31 @@ class Guardian:
         self._tick = 0
 
     def tick(self, scheduled: float, lateness: float = 0.0, late: int = 0) -> None:
-        """One turn of the loop. Never raises for anything that a bus, a policy or an operator does."""
-        clock, state = self.clock, self._state
+        """One turn of the loop: sense, leave the pilot time to answer, act."""
+        self.sense(scheduled, lateness, late)
+        self.clock.sleep_until(scheduled + self.response)
+        self.act()
+
+    def sense(self, scheduled: float, lateness: float = 0.0, late: int = 0) -> None:
+        """Take in what the robot said and publish it. Never raises for anything that a bus does."""
+        r, start = self.record, self.clock.now()
+        self._guard(lambda: self.robot.read(start, self._state))
+        r["time"], r["tick"], r["late"], r["timing.lateness"] = scheduled, self._tick, late, lateness
+        r["state.time"], r["state.imu_age"] = self._state.time, self._state.imu_age
+        r["timing.read"] = self.clock.now() - start
+        self.states.write(r)
+
+    def act(self) -> None:
+        """Let the gate decide on the newest request and send the outcome. Never raises for anything that a bus, a policy
+        or an operator does."""
+        clock = self.clock
         start = clock.now()
-        self._guard(lambda: self.robot.read(start, state))
-        read = clock.now()
         calls = self._obey_operator(start)
-        command = self.safety.step(state, self._request(), start)
+        command = self.safety.step(self._state, self._request(), start)
         judged = clock.now()
         self._transmit(command)
         self._report_fault()
-        self._publish(command, scheduled, lateness, late, calls, (start, read, judged, clock.now()))
+        self._store(command, calls, (start, judged, clock.now()))
         self._tick += 1
 
     def stop_at_once(self) -> None:
@@ -185,31 +202,26 @@ class Guardian:
             self.tell(self.safety.explain(fault, self.robot.config.joint_names))
         self._told_fault = fault
 
-    def _publish(self, command, scheduled, lateness, late, calls, times) -> None:
+    def _store(self, command: JointCommand, calls: Calls, times: tuple[float, float, float]) -> None:
+        """Complete the tick's record, for the log and for the next ``sense`` to publish."""
         r, fault = self.record, self.safety.fault
-        start, read, judged, written = times
-        r["time"], r["tick"], r["late"] = scheduled, self._tick, late
+        start, judged, written = times
         r["now"], r["calls"] = start, int(calls)
         r["mode"], r["limited"] = self.safety.mode, self.safety.limited
         r["fault"] = fault.rule.number if fault else 0
         r["fault_joint"] = fault.joint if fault else -1
-        r["state.time"], r["state.imu_age"] = self._state.time, self._state.imu_age
         _copy(self._wish, self._requested)
         r["request.time"] = self._wish.time
         _copy(command, self._sent)
         r["command.time"] = command.time
-        r["timing.lateness"], r["timing.read"] = lateness, read - start
-        r["timing.safety"], r["timing.write"] = judged - read, written - judged
-        for i, bus in enumerate(self.robot.buses):
-            counters = bus.counters
-            r["bus.sent"][0, i], r["bus.received"][0, i] = counters.sent, counters.received
-            r["bus.rejected"][0, i], r["bus.lost"][0, i] = counters.rejected, counters.lost
+        r["timing.safety"], r["timing.write"] = judged - start, written - judged
+        counted = [(b.counters.sent, b.counters.received, b.counters.rejected, b.counters.lost) for b in self.robot.buses]
+        r["bus.sent"][0], r["bus.received"][0], r["bus.rejected"][0], r["bus.lost"][0] = zip(*counted, strict=True)
         frames = (r["bus.sent"] + r["bus.received"])[0]
         r["bus.load"][0] = (frames - self._frames) * self._load if self._tick else 0.0  # not what connecting took
         self._frames = frames
-        self.states.write(r)
         if self.sink is not None:
-            self.sink.write(TICK, scheduled, r)
+            self.sink.write(TICK, float(r["time"][0]), r)
 
 
 def _copy(source: JointCommand, target: JointCommand) -> None:

@@ -16,6 +16,8 @@ from sim2real.run import Life, RunSpec, channel, keep_time, sink, tell
 from sim2real.skills import SkillPlayer
 from sim2real.types import Mode, OperatorInput
 
+PHASE = 0.0005  # s after the guardian's tick: it has read the buses by then
+
 
 def layout_of(player: SkillPlayer) -> Layout:
     """The Pilot layout for everything ``player`` may feed its policies."""
@@ -127,7 +129,7 @@ def main(directory: Path) -> int:
             tell(f"kept the current skill: {refusal.skill}: {refusal.reason}")
         refused = len(player.refusals)
 
-    keep_time(tick, player.period, spec, 70, life.goes_on)
+    keep_time(tick, player.period, spec, 70, life.goes_on, PHASE)
     return 0
 
 

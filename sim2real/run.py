@@ -92,8 +92,12 @@ def keep_time(
     spec: RunSpec,
     priority: int,
     goes_on: Callable[[], bool],
+    phase: float = 0.0,
 ) -> None:
-    """Call ``tick(scheduled, lateness, late)`` on an absolute schedule while ``goes_on()``."""
+    """Call ``tick(scheduled, lateness, late)`` on an absolute schedule while ``goes_on()``.
+
+    Ticks are due at whole periods of the monotonic clock plus ``phase`` (s), so that processes agree without talking.
+    """
     clock = MonotonicClock()
     cpus = sorted(os.sched_getaffinity(0))
     if spec.tune:
@@ -101,7 +105,7 @@ def keep_time(
         clock.spin = granted.spin
         tell(f"tuned: {granted}", tuning=str(granted))
     schedule = Schedule(clock, period)
-    schedule.start()
+    schedule.start(at=(int(clock.now() / period) + 2) * period + phase)
     while goes_on():
         due = schedule.wait()
         tick(due, schedule.lateness, schedule.late)

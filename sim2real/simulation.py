@@ -1,8 +1,8 @@
 """A whole run in one process and in lockstep: the production classes on a simulated clock, faster than real time.
 
 Everything above the wire is what runs on a robot. Only time is different: the guardian's sleep advances the world, and the
-pilot ticks right after the guardian tick that is due with it, so its command reaches the motors one bus tick later, as it
-would from a process of its own. Same seed, same bytes.
+pilot ticks between the guardian's sensing and acting, where a process of its own would have answered too. Same seed, same
+bytes.
 """
 
 from __future__ import annotations
@@ -127,9 +127,12 @@ class Simulation:
                 world.push(pushes.pop(0)[1])
             store(self.operator.read(now, self.since), self.player.labels, self._operator_record)
             self._operator_channel.write(self._operator_record)
-            self.guardian.tick(due, self.schedule.lateness, self.schedule.late)
+            self.guardian.sense(due, self.schedule.lateness, self.schedule.late)
             if self.guardian.record["tick"][0] % self.every == 0:
                 self.pilot.tick(due)
+            self.clock.sleep_until(due + self.guardian.response)
+            self.guardian.act()
+            if self.guardian.record["tick"][0] % self.every == 0:
                 self.measures.observe(world, self.guardian.record, self.pilot.record, self.since)
             self.measures.tick(self.guardian.record)
             if self.each_tick is not None:
