@@ -92,8 +92,10 @@ class Bench:
 
 def predicted(command: JointCommand, joint_pos: np.ndarray, joint_vel: np.ndarray) -> np.ndarray:
     """The torque that motors obeying ``command`` would make, N m (n,)."""
-    return command.kp * (command.joint_pos - joint_pos) + command.kd * (command.joint_vel - joint_vel) + (
-        command.joint_torque
+    return (
+        command.kp * (command.joint_pos - joint_pos)
+        + command.kd * (command.joint_vel - joint_vel)
+        + (command.joint_torque)
     )
 
 

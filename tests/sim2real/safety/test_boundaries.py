@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from bench import DT, FIELDS, G, Bench, predicted
+from bench import DT, FIELDS, Bench, G, predicted
 
 from sim2real.safety import RULES
 from sim2real.safety.rules import CLAMPS, When

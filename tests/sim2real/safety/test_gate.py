@@ -8,7 +8,7 @@ import warnings
 
 import numpy as np
 import pytest
-from bench import DT, FIELDS, G, Bench, copy, predicted
+from bench import DT, FIELDS, Bench, G, copy, predicted
 
 from sim2real.safety import RULES, Limits, Safety
 from sim2real.safety.evidence import Evidence
