@@ -55,6 +55,11 @@ class Basics:
     hidden: tuple[int, ...] = (256, 128)
     action_ratio: float = 0.25  # action 1 moves the target by this share of torque / kp
     action_max: float = 6.0
+    # An ankle strategy to start from, in the manner of a person standing: ankle targets move by offset rad, against the
+    # centre of mass being ahead of the ankles, + gain x pitch + damping x pitch rate. Alone it stands for some seconds.
+    balance_offset: float = 0.19  # rad
+    balance_gain: float = 2.3  # rad of ankle per rad of pitch
+    balance_damping: float = 0.25  # rad per rad/s
     reference_rate: float = 2.5  # rad/s, the fastest a reference moves
     reference_pull: float = 8.0  # 1/s, how eagerly it moves towards its goal
     position_margin: float = 0.05  # rad inside the mechanical range; wider than the safety gate's
@@ -75,7 +80,7 @@ class Basics:
     ppo: dict[str, float | int | str | bool] = field(
         default_factory=lambda: {
             "num_learning_epochs": 5,
-            "num_mini_batches": 6,
+            "num_mini_batches": 12,
             "clip_param": 0.2,
             "lam": 0.95,
             "value_loss_coef": 1.0,

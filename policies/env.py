@@ -106,7 +106,7 @@ class Env(VecEnv):
         """Send the action's targets, late by each robot's delay, and let the physics run."""
         self._last_action, before = self.action, self.target.numpy()
         self.action = self.graph.clip(action)
-        self.target = self.graph.target(self.reference, self.action)
+        self.target = self.graph.target(self.measured, self.action)
         delay = np.floor(self.random.drawn["action_delay"][:, 0])
         delay += self.rng.random(self.num_envs) < self.random.drawn["jitter"][:, 0]
         late = np.arange(self.substeps)[None, :, None] < delay[:, None, None]
@@ -158,15 +158,14 @@ class Env(VecEnv):
             self.skill, self.carry_skill, self.phase, self.reference
         )
         self.carry_skill = self.skill.clone()
-        self.observation = observe(
-            Signals(
-                **self.signals,
-                home=self.graph.home,
-                phase=self.phase,
-                reference=self.reference,
-                last_action=self.action,
-            )
+        self.measured = Signals(
+            **self.signals,
+            home=self.graph.home,
+            phase=self.phase,
+            reference=self.reference,
+            last_action=self.action,
         )
+        self.observation = observe(self.measured)
 
     # between periods
 

@@ -39,10 +39,12 @@ def run_episodes(config: Basics, graph: PolicyGraph, script: np.ndarray, push: f
     return Episodes(survived, errors.mean(axis=0))
 
 
-def random_script(config: Basics, labels: int, episodes: int, seconds: float, seed: int = 0) -> np.ndarray:
-    """(episodes, ticks): a random label every 2.5 s."""
+def random_script(
+    config: Basics, labels: int, episodes: int, seconds: float, every: float = 2.5, seed: int = 0
+) -> np.ndarray:
+    """(episodes, ticks): a random label every ``every`` seconds."""
     rng = np.random.default_rng(seed)
-    block = round(2.5 / config.period)
+    block = round(every / config.period)
     blocks = int(np.ceil(seconds / config.period / block))
     return np.repeat(rng.integers(labels, size=(episodes, blocks)), block, axis=1)[:, : round(seconds / config.period)]
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from policies.basics import MOTIONS, Basics
-from policies.observations import Signals, observe
+from policies.observations import Signals, gravity_in_base, observe
 from policies.references import References
 from sim2real.config import RobotConfig, load_robot
 
@@ -17,12 +17,13 @@ from sim2real.config import RobotConfig, load_robot
 class PolicyGraph(nn.Module):
     """Residual actions on a reference pose.
 
-    ``target = clip(reference + scale * clip(action))``, with the reference from the skill's formula, the action from the
-    actor. ``actor`` and ``critic`` map a raw observation (N, size) to actions (N, n) and a value (N, 1); without them
+    ``target = clip(reference + balance + scale * clip(action))``, with the reference from the skill's formula, a simple
+    ankle strategy for balance, and the action from the actor. ``actor`` and ``critic`` map a raw observation (N, size) to actions (N, n) and a value (N, 1); without them
     the graph still observes and makes targets, which is all that the training environment needs of it.
     """
 
     scale: Tensor
+    ankles: Tensor
     lower: Tensor
     upper: Tensor
     value_healthy: Tensor
@@ -46,6 +47,8 @@ class PolicyGraph(nn.Module):
         self.register_buffer("scale", _buffer(config.action_ratio * robot.torque_max / robot.home_kp))
         self.register_buffer("lower", _buffer(robot.position_min + margin))
         self.register_buffer("upper", _buffer(robot.position_max - margin))
+        ankles = ["ankle_pitch" in name for name in robot.joint_names]
+        self.register_buffer("ankles", torch.tensor(ankles, dtype=torch.float32))
         self.register_buffer("value_healthy", torch.ones(len(self.labels)))
         self.actor: nn.Module = nn.Identity()
         self.critic: nn.Module = nn.Identity()
@@ -54,9 +57,14 @@ class PolicyGraph(nn.Module):
     def home(self) -> Tensor:
         return self.references.home
 
-    def target(self, reference: Tensor, action: Tensor) -> Tensor:
-        """Joint targets (N, n) rad."""
-        return torch.minimum(torch.maximum(reference + self.scale * action, self.lower), self.upper)
+    def target(self, signals: Signals, action: Tensor) -> Tensor:
+        """Joint targets (N, n) rad for a clipped ``action`` (N, n)."""
+        config = self.config
+        pitch = gravity_in_base(signals.orientation_base_in_world)[:, 0:1]  # sine of the forward lean
+        pitch_rate = signals.angular_velocity_base_in_base[:, 1:2]
+        ankle = config.balance_offset + config.balance_gain * pitch + config.balance_damping * pitch_rate
+        target = signals.reference + self.ankles * ankle + self.scale * action
+        return torch.minimum(torch.maximum(target, self.lower), self.upper)
 
     def clip(self, action: Tensor) -> Tensor:
         return torch.clamp(action, -self.config.action_max, self.config.action_max)
@@ -120,26 +128,16 @@ class PolicyGraph(nn.Module):
         every = torch.eye(len(self.labels))
         rows = lambda x: x.expand(len(self.labels), -1)  # noqa: E731
         phases, references = self.references.advance(every, rows(carry_skill), rows(carry_phase), rows(carry_reference))
-        observations = observe(
-            Signals(
-                rows(joint_pos),
-                rows(joint_vel),
-                rows(orientation_base_in_world),
-                rows(angular_velocity_base_in_base),
-                every,
-                self.home,
-                phases,
-                references,
-                rows(carry_action),
-            )
-        )
+        measured = joint_pos, joint_vel, orientation_base_in_world, angular_velocity_base_in_base
+        observations = observe(Signals(*map(rows, measured), every, self.home, phases, references, rows(carry_action)))
         observation = skill @ observations
-        reference = skill @ references
+        phase, reference = skill @ phases, skill @ references
+        signals = Signals(*measured, skill, self.home, phase, reference, carry_action)
         action = self.clip(self.actor(observation))
         value = (self.critic(observations).T / self.value_healthy).reshape(1, -1)
         return (
-            self.target(reference, action),
-            skill @ phases,
+            self.target(signals, action),
+            phase,
             skill + 0.0,
             reference,
             action,

@@ -205,3 +205,36 @@ def git_revision() -> str:
     with contextlib.suppress(OSError):
         return run("rev-parse", "HEAD") + ("+" if run("status", "--porcelain", "--", "policies", "configs") else "")
     return ""
+
+
+def train_command(folder: Path, **settings: float) -> None:
+    """``sim2real train``: a progress line with the time left, and what the run came to."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    config = load_config(folder) if (folder / "config.json").is_file() else Basics()
+    training = Training(dataclasses.replace(config, **settings), folder)  # type: ignore[arg-type]
+    resumed = training.resume()
+    console = Console()
+    console.print(
+        f"{'resuming' if resumed else 'training'} in {folder}: {training.env.num_envs} robots, "
+        f"{training.samples / 1e6:.1f} of {training.config.samples / 1e6:.1f} M samples done"
+    )
+    columns = (TextColumn("{task.percentage:5.1f} %"), BarColumn(), TimeElapsedColumn(), TextColumn("left"),
+               TimeRemainingColumn(elapsed_when_finished=True), TextColumn("{task.description}"))  # fmt: skip
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("", total=training.config.samples, completed=training.samples)
+
+        def report(row: dict[str, float]) -> None:
+            text = f"reward {row['reward']:.2f}  fell {row['fell']}  push level {row['level']:.2f}"
+            progress.update(bar, completed=row["samples"], description=text)
+            if "survival" in row:
+                console.print(
+                    f"{row['samples'] / 1e6:6.2f} M samples: {row['survival']:.0%} survive 10 s, "
+                    f"{row['survival_pushed']:.0%} with pushes to 0.5 m/s"
+                )
+
+        training.run(report)
+    console.print(
+        f"best: {training.best:.1%} mean survival, {folder / 'best.pt'}; next: sim2real eval --folder {folder}"
+    )

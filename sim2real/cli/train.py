@@ -1,0 +1,49 @@
+"""Train a policy in simulation. Resumes by itself; needs `pip install 'sim2real[train]'`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from sim2real.types import Sim2realError
+
+
+@dataclass(frozen=True)
+class Args:
+    """Train a policy in simulation: config, curve and checkpoints go to a folder, from which a second call resumes."""
+
+    task: tyro.conf.Positional[Literal["g1-basics"]]
+    """what to train"""
+    folder: Path | None = None
+    """where the run lives; default: runs/<task>"""
+    samples: float | None = None
+    """policy ticks to learn from, over all robots; default: the task's own"""
+    envs: int | None = None
+    """robots simulated at once"""
+    threads: int | None = None
+    """threads of the physics"""
+    seed: int | None = None
+    """of everything random"""
+
+
+def main(argv: list[str]) -> int:
+    args = tyro.cli(Args, args=argv, prog="sim2real train")
+    training_side("policies.train").train_command(
+        folder=args.folder or Path("runs") / args.task,
+        **{k: getattr(args, k) for k in ("samples", "envs", "threads", "seed") if getattr(args, k) is not None},
+    )
+    return 0
+
+
+def training_side(module: str):
+    """A module of the training side. Raises Sim2realError where its dependencies are not installed."""
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise Sim2realError(
+            f"{module}: needs '{error.name}', which is not installed; pip install 'sim2real[train]'"
+        ) from None

@@ -1,0 +1,64 @@
+"""Training: a resumed run is the run that never stopped, and it leaves what it should beside its checkpoints."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+import torch
+
+from policies.basics import Basics
+from policies.train import Training, load_config, load_graph
+from sim2real.types import Sim2realError
+
+TINY = Basics(envs=8, horizon=4, hidden=(16,), save_every=2, evaluate_every=1000, samples=8 * 4 * 4,
+              ppo={**Basics().ppo, "num_mini_batches": 2, "num_learning_epochs": 1})  # fmt: skip
+
+
+def parameters(training: Training) -> dict[str, torch.Tensor]:
+    return {
+        **training.ppo.actor.state_dict(),
+        **{f"critic.{k}": v for k, v in training.ppo.critic.state_dict().items()},
+    }
+
+
+def test_a_resumed_run_continues_exactly(tmp_path):
+    whole = Training(TINY, tmp_path / "whole")
+    whole.run()
+    half = Training(dataclasses.replace(TINY, samples=8 * 4 * 2), tmp_path / "split")
+    half.config = TINY  # the same schedule, interrupted after two iterations
+    for _ in range(2):
+        half.step()
+    half.folder.mkdir()
+    half._save("last.pt")
+    rest = Training(TINY, tmp_path / "split")
+    assert rest.resume() and rest.iteration == 2
+    rest.run()
+    assert rest.iteration == whole.iteration == 4
+    for name, value in parameters(whole).items():
+        assert torch.equal(value, parameters(rest)[name]), name
+    assert whole.env.state_dict() == rest.env.state_dict()
+
+
+def test_a_run_leaves_its_config_and_curve(tmp_path):
+    rows = []
+    Training(TINY, tmp_path).run(rows.append)
+    document = json.loads((tmp_path / "config.json").read_text())
+    assert document["config"]["seed"] == TINY.seed and document["tools"]["mujoco"]
+    assert load_config(tmp_path) == TINY
+    curve = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    assert curve == rows and [r["samples"] for r in curve] == [32, 64, 96, 128]
+    graph = load_graph(tmp_path, "last.pt")
+    assert graph.actor(torch.zeros(1, *graph.outputs()["observation"])).shape == (1, 29)
+
+
+def test_no_checkpoint_is_refused_with_the_next_step(tmp_path):
+    with pytest.raises(Sim2realError, match="sim2real train g1-basics"):
+        load_graph(tmp_path)
+
+
+def test_the_learning_rate_is_annealed(tmp_path):
+    training = Training(TINY, tmp_path)
+    rates = [training.step()["learning_rate"] for _ in range(4)]
+    assert rates[0] == TINY.learning_rate[0] and rates == sorted(rates, reverse=True)
