@@ -18,7 +18,7 @@ import numpy as np
 from drivers.bus import BusCounters, BusError, BusSpec, Clock, MotorCommand, MotorState
 from drivers.wire import ERROR, CanWire, WireError, WireFull
 
-TRIES = 3  # of a request while connecting
+TRIES = 7  # of a request while connecting: a motor that loses every tenth frame still connects
 ANSWER_TIME = 0.04  # s to wait for the answers to one try
 POLL_PERIOD = 0.001  # s between two looks at the wire while waiting
 QUEUE_FULL_TIME = 1.0  # s with no tick going out whole, then the bus is dead

@@ -136,7 +136,7 @@ def test_every_silent_motor_is_named_within_its_time():
     with pytest.raises(BusError) as refused:
         bus.connect(clock)
     lines = str(refused.value).splitlines()
-    assert "motor of joint_1 (id 0x1): no answer on 0x11 to a request for register PMAX, tried 3 times" in lines[0]
+    assert "motor of joint_1 (id 0x1): no answer on 0x11 to a request for register PMAX, tried 7 times" in lines[0]
     assert "joint_3" in lines[1]
     assert "socketcan can7: Frames from other identifiers: none. Check power" in lines[2]
     assert clock.now() - 100 <= TRIES * ANSWER_TIME + 1e-6 <= 0.3
