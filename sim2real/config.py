@@ -73,7 +73,7 @@ class SafetyConfig(Strict):
     imu_age: Positive = 0.04  # s
     imu_frozen: Positive = 4  # consecutive bit-identical gyro samples; one more is a fault
     orientation_norm: Positive = 0.01  # distance of the base quaternion's norm from 1
-    enable_time: Positive = 0.1  # s, while armed, without a motor saying that it is enabled
+    enable_time: Positive = 0.06  # s, while armed, without a motor saying that it is enabled
     command_age_hold: Positive = 0.04  # s without a fresh command: hold
     command_age: Positive = 0.06  # s without a fresh command: damp
     hold_time: Positive = 0.04  # s: longest hold of any cause, then damp
@@ -307,7 +307,8 @@ def explain(where: str, error: ValidationError, model: type[BaseModel]) -> str:
             key, fields = str(e["loc"][-1]), _fields_at(model, e["loc"][:-1])
             lines.append(f"{path}: unknown key{did_you_mean(key, fields)}; expected one of {', '.join(fields)}")
         elif e["type"] == "value_error":
-            lines.append(f"{path}: {e['ctx']['error']}" if path else str(e["ctx"]["error"]))
+            said = str(e.get("ctx", {}).get("error"))
+            lines.append(f"{path}: {said}" if path else said)
         elif e["type"] == "missing":
             lines.append(f"{path}: missing; add it")
         else:
