@@ -12,7 +12,7 @@ import json
 import resource
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -206,7 +206,7 @@ def _read_contract(data: bytes, where: str) -> Contract:
     return contract
 
 
-def _tensor(kind: str, shape: list[int | str]) -> str:
+def _tensor(kind: str, shape: Sequence[int | str]) -> str:
     return f"{kind}[{', '.join(map(str, shape))}]"
 
 

@@ -16,8 +16,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from policies.adopt import Draft, Step
-from policies.adopt.splice import IR_VERSION, OPSET, splice
-from policies.adopt.torchscript import read_torchscript
+from policies.adopt.lstm import rebuild_lstm
+from policies.adopt.splice import splice
 from sim2real.config import Positive, RobotConfig, Unsigned, explain
 from sim2real.graph import refuse_strange
 from sim2real.policy import PolicyError
@@ -120,7 +120,7 @@ def read(source: Path, configs: Sequence[Path], robot: RobotConfig) -> Draft:
         raise PolicyError(f"{source}: got robot '{robot.name}', expected one of {', '.join(MOTORS)}: unitree_rl_gym")
     file = _network_file(source)
     config = _read_configs(configs or sorted(file.parent.glob("*.yaml")), file.parent)
-    network = _rebuild(file, config) if file.suffix == ".pt" else _read_onnx(file)
+    network = rebuild_lstm(file, config.num_obs) if file.suffix == ".pt" else _read_onnx(file)
     hidden = network.graph.output[1].type.tensor_type.shape.dim[-1].dim_value
     n, steps = config.num_actions, round(GAIT_PERIOD / config.control_dt)
     text = GRAPH.format(n=n, size=config.num_obs, hidden=hidden)
@@ -173,7 +173,7 @@ def deploy_script(config: Config, network: ModelProto, hidden: int) -> Step:
             ]
         ).astype(np.float32)
         answer, *state = session.run(None, dict(zip(names, [observation[None], *state], strict=True)))
-        action, tick = answer[0], tick + 1
+        action, tick = np.asarray(answer)[0], tick + 1
         return {
             "observation": observation,
             "action": action,
@@ -244,8 +244,8 @@ def _fields(config: Config, robot: RobotConfig, file: Path, hidden: int) -> dict
         rows = zip(config.arm_waist_joint2motor_idx, config.arm_waist_target, config.arm_waist_kps, config.arm_waist_kds, strict=True)  # fmt: skip
         hold = {motors[i]: {"position": q, "kp": kp, "kd": kd} for i, q, kp, kd in rows}
     else:
-        rows = zip(robot.joint_names, robot.home_pos, robot.home_kp, robot.home_kd, strict=True)
-        hold = {j: {"position": q, "kp": kp, "kd": kd} for j, q, kp, kd in rows if j not in joints}
+        rows = zip(robot.joint_names, robot.home_kp, robot.home_kd, strict=True)
+        hold = {j: {"position": 0.0, "kp": kp, "kd": kd} for j, kp, kd in rows if j not in joints}
     # The network was trained with this upper body welded: hold it as stiffly as the motors allow, in the posture that has
     # its centre of mass where the training model had it.
     for joint, plan in hold.items():
@@ -302,69 +302,3 @@ def _read_onnx(file: Path) -> ModelProto:
         names = [v.name for v in network.graph.output]
         raise PolicyError(f"{file}: got outputs {names} {shapes}, expected action, hidden and cell state [1, 1, size]")
     return network
-
-
-def _rebuild(file: Path, config: Config) -> ModelProto:
-    """The LSTM and MLP of a TorchScript file as ONNX, proved against the file's own answers."""
-    import onnx
-    from onnx import helper, numpy_helper
-
-    probe = np.random.default_rng(0).normal(size=(100, config.num_obs)).astype(np.float32)
-    weights, expected = read_torchscript(file, probe)
-    layers = sorted(int(k.split(".")[1]) for k in weights if k.startswith("actor.") and k.endswith(".weight"))
-    if "memory.weight_hh_l0" not in weights or "memory.weight_hh_l1" in weights or not layers:
-        raise PolicyError(
-            f"{file}: got weights {sorted(weights)}, expected memory.*_l0 (one LSTM) and actor.<i>.* (MLP)"
-        )
-    hidden = weights["memory.weight_hh_l0"].shape[1]
-
-    def gates(name: str) -> np.ndarray:
-        """torch stacks i, f, g, o; ONNX i, o, f, g (there named c)."""
-        i, f, g, o = np.split(weights[f"memory.{name}_l0"], 4)
-        return np.concatenate([i, o, f, g])
-
-    tensors = {
-        "W": gates("weight_ih")[None],
-        "R": gates("weight_hh")[None],
-        "B": np.concatenate([gates("bias_ih"), gates("bias_hh")])[None],
-        "time": np.array([0]),
-        "time_direction": np.array([0, 1]),
-    }
-    nodes = [
-        helper.make_node("Unsqueeze", ["obs", "time"], ["sequence"]),
-        helper.make_node("LSTM", ["sequence", "W", "R", "B", "", "h_in", "c_in"], ["Y", "h_out", "c_out"], hidden_size=hidden),
-        helper.make_node("Squeeze", ["Y", "time_direction"], ["x0"]),
-    ]  # fmt: skip
-    for k, i in enumerate(layers):
-        tensors |= {f"W{k}": weights[f"actor.{i}.weight"], f"b{k}": weights[f"actor.{i}.bias"]}
-        last = i == layers[-1]
-        nodes.append(helper.make_node("Gemm", [f"x{k}", f"W{k}", f"b{k}"], ["action" if last else f"z{k}"], transB=1))
-        if not last:
-            nodes.append(helper.make_node("Elu", [f"z{k}"], [f"x{k + 1}"]))
-    value = lambda name, *shape: helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, shape)  # noqa: E731
-    graph = helper.make_graph(
-        nodes,
-        "unitree_rl_gym",
-        [value("obs", 1, config.num_obs), value("h_in", 1, 1, hidden), value("c_in", 1, 1, hidden)],
-        [value("action", 1, config.num_actions), value("h_out", 1, 1, hidden), value("c_out", 1, 1, hidden)],
-        [numpy_helper.from_array(v, n) for n, v in tensors.items()],
-    )
-    network = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
-    error = np.abs(_answers(network, probe, hidden) - expected).max()
-    if not error < 1e-4:
-        raise PolicyError(
-            f"{file}: got a rebuilt network that differs by {error:.1e} from the TorchScript one, expected below 1e-4;"
-            " it is not an LSTM followed by an ELU MLP: adopt an ONNX file of it"
-        )
-    return network
-
-
-def _answers(network: ModelProto, probe: np.ndarray, hidden: int) -> np.ndarray:
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(network.SerializeToString(), providers=["CPUExecutionProvider"])
-    state, rows = [np.zeros((1, 1, hidden), np.float32)] * 2, []
-    for row in probe:
-        answer, *state = session.run(None, {"obs": row[None], "h_in": state[0], "c_in": state[1]})
-        rows.append(answer[0])
-    return np.stack(rows)

@@ -32,12 +32,12 @@ def main(argv: list[str]) -> int:
         )
     try:
         # The runtime does not import the packages above it: this command hands over to one.
-        publish = importlib.import_module("policies.publish").publish
+        release = importlib.import_module("policies.release").release
     except ModuleNotFoundError as error:
         raise Sim2realError(
             f"export: got no module '{error.name}', expected the training extra: pip install 'sim2real[train]'"
         ) from None
-    policy = publish(run, args.output, name)
+    policy = release(run, args.output, name)
     contract = policy.contract
     print(
         f"{args.output}: '{contract.name}' for {contract.robot}: {', '.join(contract.skill_labels)};"

@@ -9,6 +9,7 @@ import onnx
 import pytest
 
 from policies.adopt import DIALECTS, adopt
+from policies.adopt.unitree_rl_gym import BALANCED
 from sim2real import cli
 from sim2real.config import load_robot
 from sim2real.policy import PolicyError, load_policy
@@ -57,8 +58,9 @@ def test_contract(source, tmp_path):
     contract = policy.contract
     assert contract.joint_names == contract.target_joint_names == list(G1.joint_names[:12])
     assert list(contract.hold) == list(G1.joint_names[12:])
-    waist = contract.hold["waist_yaw_joint"]
-    assert (waist.position, waist.kp, waist.kd) == (0.0, 300.0, 3.0)
+    waist, shoulder = contract.hold["waist_yaw_joint"], contract.hold["left_shoulder_pitch_joint"]
+    assert (waist.position, waist.kp, waist.kd) == (0.0, 300.0, 5.0)  # kd: as stiff as the motor allows
+    assert (shoulder.position, shoulder.kp) == (BALANCED["left_shoulder_pitch_joint"], 100.0)
     assert contract.command_velocity_max == (0.8, 0.5, 1.57) and contract.period == 0.02
     assert contract.skill_labels == ("walk",) and contract.provenance.licence == "BSD-3-Clause"
     assert len(contract.golden) == 3 and policy.golden_error < 1e-5
@@ -84,10 +86,10 @@ def test_gravity_in_observation(source, tmp_path):
     np.testing.assert_allclose(policy.step(inputs)["observation"][3:6], [-1, 0, 0], atol=1e-6)
 
 
-def test_without_the_real_robots_configuration_the_rest_stays_home(source, tmp_path):
+def test_without_the_real_robots_configuration_the_rest_is_held_as_in_training(source, tmp_path):
     contract = walk(source, tmp_path, configs=[source / "config_mujoco_g1.yaml"]).contract
     elbow = contract.hold["left_elbow_joint"]
-    assert (elbow.position, elbow.kp, elbow.kd) == (0.6, 40.0, 2.0) and len(contract.hold) == 17
+    assert (elbow.position, elbow.kp, elbow.kd) == (0.0, 40.0, 5.0) and len(contract.hold) == 17
     assert contract.command_velocity_max == (0.5, 0.0, 0.0)
 
 

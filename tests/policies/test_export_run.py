@@ -24,25 +24,28 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     training = Training(Basics(envs=2), folder)
     (folder / "config.json").write_text(json.dumps(training._provenance()))
+    (folder / "curve.jsonl").write_text("")
     training._save("best.pt")
     return folder
 
 
+@pytest.mark.slow
 def test_export(run, tmp_path, monkeypatch, capsys):
-    from policies import publish
+    from policies import release
     from policies.train import load_config, load_graph
 
-    monkeypatch.setattr(publish, "ROBOTS", 12)
-    monkeypatch.setattr(publish, "SECONDS", 4.0)
+    signals, values = release.training_signals, release.healthy_values
+    monkeypatch.setattr(release, "training_signals", lambda graph: signals(graph, ticks=20))
+    monkeypatch.setattr(release, "healthy_values", lambda graph: values(graph, episodes=2, ticks=110))
     file = tmp_path / "basics.onnx"
     assert cli.main(["export", str(run), "-o", str(file)]) == 0
     assert "golden error" in capsys.readouterr().out
     robot = load_robot("g1")
     policy, graph = load_policy(file, robot), load_graph(run)
     contract = policy.contract
-    assert contract.skill_labels == graph.labels and contract.provenance.training["samples"] == 0
+    assert contract.skill_labels == graph.labels
     for golden in contract.golden:
-        assert len({tuple(row) for row in golden.inputs["skill"]}) == 3, "skills change within a golden sequence"
+        assert len({tuple(row) for row in golden.inputs["skill"]}) > 1, "skills change within a golden sequence"
     assert set(contract.envelope) == {n for n in contract.inputs if not n.startswith("carry_")}
     follow(policy, load_config(run), graph)
 
