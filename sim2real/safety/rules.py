@@ -123,7 +123,7 @@ RULES = (
     Rule(19, "hold_time", DAMP, ARMED, 0.048, "F3, F5, F7",
          lambda e: e.held_for(), lambda m: m.hold_time, "s held",
          "the cause of a hold did not end", "see the fault that began the hold"),
-    Rule(20, "motor_enabled", DAMP, ARMED, 0.104, "F2; IEC 60204-1 loss of an actuator",
+    Rule(20, "motor_enabled", DAMP, ARMED, 0.064, "F2; IEC 60204-1 loss of an actuator",
          lambda e: e.disabled_for(), lambda m: m.enable_time, "s without enable",
          "a motor does not say that it is enabled", "see its error and its watchdog, then arm again"),
     Rule(21, "tick_gap", DAMP, ARMED, 0.0, "F8, F25",

@@ -240,9 +240,9 @@ def test_every_rule_and_every_clamp_has_its_case():
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
-def test_fault(robot, rule, sign):
+def test_fault(robot, joints, rule, sign):
     case = getattr(FaultCases(), rule.name)
-    for joint in range(len(robot.joint_names)):
+    for joint in joints:
         for outside in (False, True):
             bench = Bench(robot)
             if rule.when is When.ARM:
@@ -264,9 +264,9 @@ def test_fault(robot, rule, sign):
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("clamp", CLAMPS, ids=lambda clamp: clamp.name)
-def test_clamp(robot, clamp, sign):
+def test_clamp(robot, joints, clamp, sign):
     case = getattr(ClampCases(), clamp.name)
-    for joint in range(len(robot.joint_names)):
+    for joint in joints:
         for outside in (False, True):
             bench = Bench(robot).armed()
             field, asked, expected, command = case(bench, joint, outside, sign)

@@ -1,0 +1,120 @@
+"""Mutation test of the safety gate: one small change at a time, and some test must notice.
+
+``python tools/mutate.py [FILTER]`` changes sim2real/safety/*.py in memory: a forked process gets the changed code from
+its import system and runs the gate's tests until the first failure. Prints every survivor and exits 1 if there is one.
+FILTER: only mutants whose line of output contains it. There is no list of exceptions: code that cannot be tested is
+to be written otherwise.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.machinery
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import CodeType
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+FORK = ("hypothesis.strategies", "numpy", "pytest", "sim2real.config")  # imported once, before the forks
+TESTS = ("test_gate.py", "test_safety_md.py", "test_boundaries.py", "test_sequences.py", "test_properties.py")
+HANG = 120  # s; a mutant that takes longer has been noticed
+
+LT, LE, GT, GE, EQ, NE = ast.Lt, ast.LtE, ast.Gt, ast.GtE, ast.Eq, ast.NotEq
+OPERATORS = {
+    LT: (LE, GE), LE: (LT, GT), GT: (GE, LE), GE: (GT, LT), EQ: (NE,), NE: (EQ,), ast.And: (ast.Or,),
+    ast.Or: (ast.And,), ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,), ast.In: (ast.NotIn,), ast.NotIn: (ast.In,),
+    ast.Add: (ast.Sub,), ast.Sub: (ast.Add,), ast.Mult: (ast.Div,), ast.Div: (ast.Mult,),
+}  # fmt: skip
+NAMES = {"min": "max", "minimum": "maximum", "fmin": "fmax", "argmin": "argmax", "logical_or": "logical_and"}
+NAMES |= {new: old for old, new in NAMES.items()}
+
+
+def replacements(node: object, field: str) -> Iterator[ast.AST]:
+    """What may stand in the place of ``node``."""
+    if field == "test":
+        yield ast.UnaryOp(ast.Not(), node)
+    match node:
+        case ast.cmpop() | ast.boolop() | ast.operator():
+            yield from (new() for new in OPERATORS.get(type(node), ()))
+        case ast.UnaryOp():
+            yield node.operand
+        case ast.Constant(value=bool(v)):
+            yield ast.Constant(not v)
+        case ast.Constant(value=int(v) | float(v)):
+            yield ast.Constant(v + 1)
+        case ast.Name(id=name) if name in NAMES:
+            yield ast.Name(NAMES[name], node.ctx)
+        case ast.Attribute(attr=name) if name in NAMES:
+            yield ast.Attribute(node.value, NAMES[name], node.ctx)
+        case ast.Return():
+            yield from (ast.Return(ast.Constant(None)), ast.Pass())
+        case (
+            ast.Assign() | ast.AugAssign() | ast.AnnAssign(value=ast.expr()) | ast.Raise() | ast.Expr(value=ast.Call())
+        ):
+            yield ast.Pass()
+
+
+def mutants(path: Path) -> Iterator[tuple[str, CodeType]]:
+    """(what was changed where, the module's code with it) for every mutant of a file."""
+    tree = ast.parse(path.read_text())
+    for parent in list(ast.walk(tree)):
+        for field, value in ast.iter_fields(parent):
+            for i, node in enumerate(value if isinstance(value, list) else [value]):
+                for new in replacements(node, field):
+                    line = getattr(node, "lineno", getattr(parent, "lineno", 0))
+                    change = f"{path.relative_to(ROOT)}:{line}: {_text(node)} -> {_text(new)}"
+                    setattr(parent, field, [*value[:i], new, *value[i + 1 :]] if isinstance(value, list) else new)
+                    yield change, compile(ast.fix_missing_locations(tree), str(path), "exec")
+                setattr(parent, field, value)
+
+
+def _text(node: ast.AST) -> str:
+    return ast.unparse(node).split("\n")[0] or type(node).__name__
+
+
+def born(module: str = "", code: CodeType | None = None) -> int:
+    """Fork a process that is the mutant, is tested, and ends with 0 if nobody noticed. Returns its id."""
+    if pid := os.fork():
+        return pid
+    import pytest
+
+    signal.alarm(HANG)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    os.dup2(1, 2)
+    loader, original = importlib.machinery.SourceFileLoader, importlib.machinery.SourceFileLoader.get_code
+    loader.get_code = lambda self, name: code if name == module else original(self, name)
+    tests = [str(ROOT / "tests/sim2real/safety" / name) for name in TESTS]
+    os._exit(pytest.main(["-xq", "-pno:cacheprovider", "--joints=2", f"--rootdir={ROOT}", *tests]))
+
+
+def main(wanted: str = "") -> int:
+    begin = time.monotonic()
+    for name in FORK:
+        importlib.import_module(name)
+    if os.waitpid(born(), 0)[1]:
+        sys.exit("the tests of the gate fail on the gate itself: run pytest tests/sim2real/safety, then come back")
+    files = sorted((ROOT / "sim2real/safety").glob("*.py"))
+    todo = [(text, f"sim2real.safety.{f.stem}", code) for f in files for text, code in mutants(f) if wanted in text]
+    running, survivors = {}, 0
+    queue = iter(todo)
+    while True:
+        while len(running) < (os.cpu_count() or 1) and (mutant := next(queue, None)):
+            running[born(*mutant[1:])] = mutant[0]
+        if not running:
+            break
+        pid, status = os.wait()
+        text = running.pop(pid)
+        if status == 0:
+            survivors += 1
+            print(f"survived  {text}", flush=True)
+    print(f"{len(todo)} mutants, {survivors} survived, {time.monotonic() - begin:.0f} s")
+    return bool(survivors)
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))
