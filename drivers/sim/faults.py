@@ -90,7 +90,7 @@ class Fault:
 _NUMBER = r"[0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?"
 _FAULT = re.compile(
     rf"(?P<kind>[a-z_]+)"
-    rf"(?::(?P<bus>(?!{_NUMBER}(?:[=@]|$))[^:/=@]+)(?:/(?P<motor>[^:=@]+))?)?"
+    rf"(?::(?P<bus>(?!{_NUMBER}(?:[:=@]|$))[^:/=@]+)(?:/(?P<motor>[^:=@]+))?)?"
     rf"(?::(?P<probability>{_NUMBER}))?"
     rf"(?:=(?P<value>{_NUMBER}))?"
     rf"(?:@(?P<start>{_NUMBER})(?:-(?P<end>{_NUMBER}))?)?"

@@ -124,7 +124,9 @@ class SimMotors:
         self._data = np.zeros((n, 8), np.uint8)  # the last command of each
         self._commanded = np.zeros(n, bool)  # since it was enabled
         self._law = np.zeros((3, n))  # bias, kp, kd at the joints
-        self._settle = False
+        self._changed = False  # the law is no longer what commands and states make of it
+        self._settle = False  # the body still has the mean of two laws
+        self._taken: list[tuple[int, float]] = []  # commands (row, time) of this substep
         self._arrived_rows: list[int] = []
         self._arrived_raws: list[bytes] = []
         self._arrived_times: list[float] = []
@@ -181,7 +183,7 @@ class SimMotors:
                 self._note(time, row, "cleared")
         elif kind == Kind.SET_ZERO:
             self.zero[row] += self.position[row]
-            self._stale = True
+            self._stale = self._changed = True
             self._note(time, row, "zeroed")
         return answer
 
@@ -245,14 +247,16 @@ class SimMotors:
         if start >= self._thermal_due:
             self._warm(start)
         self._stale = True
-        if self._arrived_rows:
-            rows, times = self._arrived_rows.copy(), np.array(self._arrived_times)
-            self._take_commands()
-            old, new = self._law, self._decide(start)
-            share = np.zeros(len(self.specs))
-            share[rows] = np.clip((end - times) / (end - start), 0.0, 1.0)
+        self._take_commands()
+        if self._changed:
+            old, new = self._law, self._decide()
+            share = np.ones(len(self.specs))
+            if self._taken:
+                rows, times = zip(*self._taken, strict=True)
+                share[list(rows)] = np.clip((end - np.array(times)) / (end - start), 0.0, 1.0)
+                self._taken.clear()
             self._body.drive(*(old + share * (new - old)))
-            self._law, self._settle = new, True
+            self._law, self._changed, self._settle = new, False, True
         elif self._settle:
             self._body.drive(*self._law)
             self._settle = False
@@ -265,17 +269,18 @@ class SimMotors:
         self._data[rows] = np.frombuffer(b"".join(self._arrived_raws), np.uint8).reshape(-1, 8)
         self.last_command_time[rows] = self._arrived_times
         self._commanded[rows] = True
+        self._taken += zip(rows, self._arrived_times, strict=True)
+        self._changed = True
         self._arrived_rows, self._arrived_raws, self._arrived_times = [], [], []
         self._set_deadline()
 
-    def _decide(self, time: float) -> np.ndarray:
+    def _decide(self) -> np.ndarray:
         """The law (3, n) that the motors' targets and states make: bias, kp, kd at the joints."""
         c = self._codec.unpack_command(self._data)
         on = self.enabled & self._commanded
         bias = c.kp * (c.position - self._offset + self.zero) + c.kd * c.velocity + c.torque
         law = np.array([self._sign * bias, c.kp, c.kd]) * on
-        # Full scales are symmetric and a code is 2^-12 of them: less is no gain, but how zero comes out.
-        effect = np.where(law[1] > 1e-6, DRIVING, np.where(law[2] > 1e-6, DAMPING, LIMP)) * on
+        effect = np.where(law[1] > 0, DRIVING, np.where(law[2] > 0, DAMPING, LIMP)) * on
         if (effect != self._effect).any():
             for row in np.flatnonzero(effect != self._effect):
                 if effect[row] != OFF:
@@ -330,9 +335,7 @@ class SimMotors:
         if not on:
             self._commanded[row] = False
             self._effect[row] = OFF
-            self._law = self._law.copy()
-            self._law[:, row] = 0.0
-            self._settle = True
+            self._changed = True
         self._accepts[row] = on
         self._note(time, row, event)
         self._set_deadline()
@@ -360,6 +363,7 @@ class SimMotors:
         self._accepts = self.enabled.tolist()
         self._body.limit(ranges.torque)
         self._stale = True
+        self._changed = True
         self._set_deadline()
 
 

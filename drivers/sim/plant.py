@@ -25,6 +25,7 @@ from drivers.sim.gantry import Gantry
 from drivers.sim.truth import Truth
 
 IMU_SITE = "sim2real/imu"
+UNLIMITED = 1e6  # N m
 
 
 class Plant:
@@ -69,8 +70,10 @@ class Plant:
         # Plain views: an attribute of MjData costs half a microsecond, an array does not.
         self._ctrl, self._bias = data.ctrl, model.actuator_biasprm
         self._force, self._sensors = data.actuator_force, data.sensordata
+        self._bolted = bool(model.body_weldid[model.site(IMU_SITE).bodyid[0]] == 0)
         self._qpos, self._qvel = data.qpos, data.qvel
         self._stood = 0.0
+        self.limit(np.full(len(joints), UNLIMITED))
         self.reset()
 
     # -- driving -----------------------------------------------------------------------------------------------------
@@ -203,6 +206,8 @@ class Plant:
     @property
     def acceleration_imu_in_imu(self) -> np.ndarray:
         """(3,) m/s^2, +g upwards at rest; of the last substep."""
+        if self._bolted:  # MuJoCo says nothing about bodies that cannot move
+            return self.data.site(IMU_SITE).xmat.reshape(3, 3).T @ -self.model.opt.gravity
         return self._sensors[7:10]
 
     @property
@@ -250,7 +255,7 @@ def _fit(spec: mujoco.MjSpec, path: str | Path, joints: Sequence[str], base: str
         motor.gaintype, motor.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
         motor.gainprm[0] = 1.0
         motor.ctrllimited, motor.forcelimited = False, True
-        motor.forcerange = (-1e6, 1e6)
+        motor.forcerange = (-UNLIMITED, UNLIMITED)
     body, place = spec.body(base), np.zeros(3)
     if imu_site:
         site = spec.site(imu_site)

@@ -214,7 +214,7 @@ class Server:
 
     def _flush(self) -> None:
         """Give the hosts what has arrived."""
-        now = self.world.time + 1e-9
+        now = self.world.time
         out = {"imu": self.world.imu.read(now)}
         for name, port in self._ports.items():
             out[name] = port.give(now)

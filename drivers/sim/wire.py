@@ -24,10 +24,12 @@ from drivers.sim.faults import FEEDBACK, HOST, POWER, Fault
 from drivers.wire import EXTENDED, FRAME, WireError, WireFull
 
 ERROR_FRAME_BITS = 20  # error flag (6), its superposition (up to 6), delimiter (8), as good as always
-BUS_OFF_COUNT = 256  # ISO 11898-1: transmit error counter above which a controller leaves the bus
+BUS_OFF_COUNT = 256  # ISO 11898-1: transmit error counter at which a controller leaves the bus
+BUS_OFF_TRIES = BUS_OFF_COUNT // 8  # failures in a row that take it there; a motor's answer is lost then
 RESTART = 0.1  # s: how long the host then stays away (restart-ms 100, the usual setting)
 QUEUE_LENGTH = 128  # frames; Linux' default of 10 is too small for a tick (set txqueuelen 128)
 BROADCAST_ID = 0x7FF
+TOLERANCE = 1e-9  # s: what sums of times may be off by
 
 
 class Motors(Protocol):
@@ -82,9 +84,9 @@ class SimCan:
         self.carried: list[bytes] = []  # raw frames since the last ``digest``
         self._motors, self._latency, self._reply_delay, self._room = motors, latency, reply_delay, queue_length
         self._bit = 1.0 / spec.bitrate
-        self._queue: deque[tuple] = deque()  # the host's: (ready, key, id, raw, bits, held)
-        self._waiting: list[tuple] = []  # heap of answers not ready yet: (ready, key, order, raw, bits, row, held)
-        self._contending: list[tuple] = []  # heap of answers that want the wire: (key, order, raw, bits, row, held)
+        self._queue: deque[tuple] = deque()  # the host's: (ready, key, id, raw, bits, tries)
+        self._waiting: list[tuple] = []  # heap of answers not ready yet: (ready, key, order, raw, bits, row, tries)
+        self._contending: list[tuple] = []  # heap of answers that want the wire: (key, order, raw, bits, row, tries)
         self._free = 0.0  # when the wire is idle again
         self._order = 0
         self._errors = 0  # the host's transmit error counter
@@ -122,7 +124,7 @@ class SimCan:
         """Frames (FRAME, (n,)) that have reached the host by ``now``."""
         inbox = self.inbox
         raws: list[bytes] = []
-        while inbox and inbox[0][0] <= now:
+        while inbox and inbox[0][0] <= now + TOLERANCE:
             raws.append(inbox.popleft()[1])
         return np.frombuffer(b"".join(raws), FRAME)
 
@@ -131,7 +133,7 @@ class SimCan:
     def take(self, ready: float, raw: bytes, ids: Iterable[int], bits: Iterable[int]) -> None:
         """Frames of the host, whose length on the wire is now known, enter its controller's queue."""
         for i, (id, n) in enumerate(zip(ids, bits, strict=True)):
-            self._queue.append((ready, priority(id), id, raw[16 * i : 16 * i + 16], n, False))
+            self._queue.append((ready, priority(id), id, raw[16 * i : 16 * i + 16], n, 0))
 
     @property
     def busy(self) -> bool:
@@ -148,9 +150,7 @@ class SimCan:
         queue, waiting, contending, powered = self._queue, self._waiting, self._contending, self._motors.powered
         receive, bus, delay, bit = self._motors.receive, self.index, self._reply_delay, self._bit
         faults = [f for f in self._faults if f[0].start < until and f[0].end > self._free] if self._faults else ()
-        away = self.away(until if self.idle else self._free)
-        if away or (queue and not any(powered[row] for row in self.rows.values())):
-            self._stall(until, away)
+        if (self._host_faults or self._away_until > self._free or not all(powered)) and self._stalls(until):
             return
         traffic, carried, inbox, latency = self.traffic, self.carried, self.inbox, self._latency
         while True:
@@ -164,16 +164,16 @@ class SimCan:
             if start >= until:
                 return
             while waiting and waiting[0][0] <= start:
-                _, key, order, raw, bits, row, held = heappop(waiting)
-                heappush(contending, (key, order, raw, bits, row, held))
+                _, key, order, raw, bits, row, tries = heappop(waiting)
+                heappush(contending, (key, order, raw, bits, row, tries))
             self._free = start
             if queue and queue[0][0] <= start and (not contending or queue[0][1] < contending[0][0]):
-                _, _, id, raw, bits, held = queue[0]
+                _, _, id, raw, bits, tries = queue[0]
                 end = start + bits * bit
                 if end > until:
                     return
                 queue.popleft()
-                copies = self._spoil_command(faults, start, id, raw, bits, held) if faults else 1
+                copies = self._spoil_command(faults, start, id, raw, bits, tries) if faults else 1
                 if copies is None:
                     continue
                 self._free = end
@@ -187,18 +187,18 @@ class SimCan:
                     if answer is not None:
                         row, key, reply, bits = answer
                         self._order += 1
-                        heappush(waiting, (end + delay, key, self._order, reply, bits, row, False))
+                        heappush(waiting, (end + delay, key, self._order, reply, bits, row, 0))
             else:
-                _, _, raw, bits, row, held = contending[0]
+                _, _, raw, bits, row, tries = contending[0]
                 end = start + bits * bit
                 if end > until:
                     return
-                key, order, raw, bits, row, held = heappop(contending)
+                key, order, raw, bits, row, tries = heappop(contending)
                 if not powered[row]:
                     continue
                 copies = 1
                 if faults:
-                    copies, raw = self._spoil_feedback(faults, start, key, raw, bits, row, held)
+                    copies, raw = self._spoil_feedback(faults, start, key, raw, bits, row, tries)
                     if copies is None:
                         continue
                 self._free = end
@@ -212,15 +212,22 @@ class SimCan:
         """Whether the host's controller is off the bus."""
         return now < self._away_until or any(f.kind == "bus_off" and f.start <= now < f.end for f in self._host_faults)
 
-    def _stall(self, until: float, away: bool) -> None:
-        """Nobody acknowledges (the first frame is sent for ever), or the host is gone (what it had queued is lost)."""
-        if away:
-            self._queue.clear()
-        elif self._queue[0][0] < until:
-            self.traffic.busy += until - max(self._free, self._queue[0][0])
-        self._waiting.clear()
+    def _stalls(self, until: float) -> bool:
+        """Whether nothing moves: the host's controller is gone (what it had queued is lost), or nobody is there to
+        acknowledge (its first frame is then sent for ever). Motors hear nothing either way."""
+        queue, waiting = self._queue, self._waiting
+        first = min((line[0][0] for line in (queue, waiting) if line), default=0.0)
+        start = self._free if self._contending else max(self._free, first)
+        if self.away(start):
+            queue.clear()
+        elif queue and not any(self._motors.powered[row] for row in self.rows.values()):
+            self.traffic.busy += max(0.0, until - max(start, queue[0][0]))
+        else:
+            return False
+        waiting.clear()
         self._contending.clear()
         self._free = max(self._free, until)
+        return True
 
     # -- faults ------------------------------------------------------------------------------------------------------
 
@@ -240,7 +247,7 @@ class SimCan:
                 if fault.probability >= 1.0 or self._random.random() < fault.probability:
                     yield fault
 
-    def _spoil_command(self, faults, start, id, raw, bits, held) -> int | None:
+    def _spoil_command(self, faults, start, id, raw, bits, tries) -> int | None:
         """How often the host's frame is heard; None: it was not carried (broken off, or held back)."""
         copies = 1
         row = self.rows.get(raw[8] | raw[9] << 8 if id == BROADCAST_ID else id, -1)
@@ -250,8 +257,8 @@ class SimCan:
                 self.traffic.dropped += 1
             elif fault.kind == "duplicate":
                 copies = 2
-            elif fault.kind == "delay" and not held:
-                self._queue.appendleft((start + fault.value, priority(id), id, raw, bits, True))
+            elif fault.kind == "delay" and tries == 0:
+                self._queue.appendleft((start + fault.value, priority(id), id, raw, bits, 1))
                 return None
             elif fault.kind == "corrupt":
                 self._break_off(start, bits)
@@ -262,11 +269,11 @@ class SimCan:
                     self._away_until = start + RESTART
                     self._queue.clear()
                 else:
-                    self._queue.appendleft((self._free, priority(id), id, raw, bits, held))
+                    self._queue.appendleft((self._free, priority(id), id, raw, bits, tries))
                 return None
         return copies
 
-    def _spoil_feedback(self, faults, start, key, raw, bits, row, held) -> tuple[int | None, bytes]:
+    def _spoil_feedback(self, faults, start, key, raw, bits, row, tries) -> tuple[int | None, bytes]:
         """How often a motor's frame is heard (None: it was not carried), and what it says by then."""
         copies: int | None = 1
         for fault in self._hits(faults, start, row):
@@ -275,14 +282,13 @@ class SimCan:
                 self.traffic.dropped += 1
             elif fault.kind == "duplicate":
                 copies = 2
-            elif fault.kind == "delay" and not held:
-                self._order += 1
-                heappush(self._waiting, (start + fault.value, key, self._order, raw, bits, row, True))
+            elif fault.kind == "delay" and tries == 0:
+                heappush(self._waiting, (start + fault.value, key, self._order, raw, bits, row, 1))
                 return None, raw
             elif fault.kind == "corrupt":
                 self._break_off(start, bits)
-                self._order += 1
-                heappush(self._waiting, (self._free, key, self._order, raw, bits, row, held))
+                if tries < BUS_OFF_TRIES:
+                    heappush(self._waiting, (self._free, key, self._order, raw, bits, row, tries + 1))
                 return None, raw
             elif fault.kind in FEEDBACK:
                 raw = self._lie(fault, row, raw)

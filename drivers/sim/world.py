@@ -29,10 +29,8 @@ from drivers.sim.imu import ImuNoise, SimImu, SimSerialWire
 from drivers.sim.motor import MotorEvent, SimMotors
 from drivers.sim.plant import Plant
 from drivers.sim.truth import Truth
-from drivers.sim.wire import QUEUE_LENGTH, SimCan, SimCanWire
+from drivers.sim.wire import QUEUE_LENGTH, TOLERANCE, SimCan, SimCanWire
 from drivers.wire import FRAME
-
-TOLERANCE = 1e-9  # s: what a caller's arithmetic may be off by
 
 
 class World:
@@ -78,7 +76,7 @@ class World:
             )  # fmt: skip
             first += len(spec.motors)
         self.imu = SimImu(imu, self.plant, seed=seed, noise=imu_noise, latency=latency)
-        now = lambda: self.time + TOLERANCE  # noqa: E731
+        now = lambda: self.time  # noqa: E731
         self.wires = {bus.spec.name: SimCanWire(bus, now) for bus in self.buses}
         self.imu_wire = SimSerialWire(self.imu, now)
         self._timestep = timestep
