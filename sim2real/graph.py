@@ -46,9 +46,8 @@ def parse(data: bytes, where: str) -> ModelProto:
     import onnx
 
     if len(data) > MAX_BYTES:
-        raise PolicyError(
-            f"{where}: got {len(data) / 2**20:.0f} MiB, expected at most {MAX_BYTES // 2**20}; is it a policy?"
-        )
+        most = MAX_BYTES // 2**20
+        raise PolicyError(f"{where}: got more than {most} MiB, expected at most {most}; is it a policy?")
     try:
         model = onnx.load_from_string(data)
     except Exception as error:  # protobuf raises DecodeError, and on some damage UnicodeDecodeError

@@ -21,7 +21,8 @@ from pydantic import ValidationError
 
 from sim2real.config import RobotConfig, did_you_mean, explain
 from sim2real.contract import CARRY, METADATA_KEY, Contract
-from sim2real.graph import PolicyError, metadata, parse, tensors
+from sim2real.graph import MAX_BYTES, PolicyError, metadata, parse, tensors
+from sim2real.skills import MEASURED
 
 __all__ = ["Mismatch", "Policy", "PolicyError", "load_policy", "mismatches", "read_contract", "refuse_mismatches"]
 
@@ -167,7 +168,8 @@ def read_contract(path: str | Path) -> Contract:
 
 def _read(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        with path.open("rb") as file:
+            return file.read(MAX_BYTES + 1)  # one more, and ``parse`` says that it is too large
     except OSError as error:
         near = sorted(p.name for p in path.parent.glob("*.onnx")) if path.parent.is_dir() else []
         hint = did_you_mean(path.name, near) or (f"; here are {', '.join(near)}" if near else "")
@@ -252,7 +254,7 @@ def mismatches(contract: Contract, robot: RobotConfig) -> list[Mismatch]:
     """Every way in which a policy does not fit a robot; empty: it fits."""
     strangers = list(_strangers(contract, robot))
     # With foreign joint names the checks by joint have nothing to compare with.
-    checks = CHECKS if not strangers else (_identity, _period)
+    checks = CHECKS if not strangers else (_identity, _signals, _period)
     return [*strangers, *(m for check in checks for m in check(contract, robot))]
 
 
@@ -321,6 +323,13 @@ def _positions(contract: Contract, robot: RobotConfig) -> Iterator[Mismatch]:
             yield Mismatch(what, f"{worst:.4g} rad", f"{low + inside:.4g} to {high - inside:.4g}", fix)
 
 
+def _signals(contract: Contract, robot: RobotConfig) -> Iterator[Mismatch]:
+    for name in contract.inputs:
+        if not name.startswith(CARRY) and name not in MEASURED:
+            fix = "train without it, or estimate it inside the graph from signals that are measured"
+            yield Mismatch(f"inputs.{name}", "a signal nothing measures", f"one of {', '.join(MEASURED)}", fix)
+
+
 def _period(contract: Contract, robot: RobotConfig) -> Iterator[Mismatch]:
     rate = robot.wiring().rate
     ticks = contract.period * rate
@@ -331,5 +340,5 @@ def _period(contract: Contract, robot: RobotConfig) -> Iterator[Mismatch]:
 
 
 CHECKS: tuple[Callable[[Contract, RobotConfig], Iterator[Mismatch]], ...] = (
-    _identity, _covers, _gains, _positions, _period,
+    _identity, _signals, _covers, _gains, _positions, _period,
 )  # fmt: skip

@@ -270,3 +270,4 @@ _SOURCES = {
     "skill": _skill,
 }
 assert set(_SOURCES) <= set(INPUTS)
+MEASURED = tuple(_SOURCES)  # the signals that a robot can feed a policy

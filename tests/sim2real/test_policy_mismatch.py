@@ -40,6 +40,10 @@ CASES = {
         {"joint_names": replaced(G1.joint_names, N, "left_knee")},
         f"joint_names: got 'left_knee', expected a joint of g1 (did you mean '{KNEE}'?)",
     ),
+    "signal": (
+        {"inputs": {"joint_pos": [len(G1.joints)], "object_position_in_base": [3], "carry_x": [1]}},
+        "inputs.object_position_in_base: got a signal nothing measures, expected one of joint_pos, joint_vel,",
+    ),
     "kp": (
         {"kp": replaced(G1.home_kp, N, np.nextafter(LIMIT.kp_max, np.inf))},
         f"kp.{KNEE}: got 300, expected at most 300; train with a lower kp, or raise kp_max in g1.yaml",

@@ -108,7 +108,7 @@ def test_without_seal(refused, g1):
 
 
 def test_too_large(refused, g1):
-    assert "MiB, expected at most 64" in refused(bytes(MAX_BYTES + 2**20))
+    assert "got more than 64 MiB, expected at most 64" in refused(bytes(MAX_BYTES + 2**20))
 
 
 def test_no_such_file(capsys, tmp_path, good):
