@@ -191,7 +191,6 @@ class CanBus:
     def _hear_all(self, clock: Clock) -> None:
         """Take in a state of every motor from after it was disabled, and make sure that it is."""
         asked = clock.now()
-        self._state.time[:] = -np.inf
 
         def take(frames: np.ndarray) -> bool:
             self.counters.rejected += self._codec.unpack(frames, self._state, clock.now())

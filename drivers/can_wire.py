@@ -13,7 +13,7 @@ from drivers.wire import ERROR, EXTENDED, FRAME, REMOTE, WireError, WireFull, ma
 FRAME_SIZE = FRAME.itemsize
 ID_MASK = 0x1FFF_FFFF
 CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h
-CAN_ERR_BUSOFF = 0x40  # linux/can/error.h
+ERRORS_HEARD = 0x04 | 0x40 | 0x100  # linux/can/error.h: controller problems, bus-off, restarted
 
 
 def interfaces() -> list[str]:
@@ -45,7 +45,7 @@ class RawCanWire:
                 f"socketcan {channel}: no SocketCAN in this system ({error}); is it Linux with CAN?"
             ) from None
         try:
-            sock.setsockopt(socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, CAN_ERR_BUSOFF)
+            sock.setsockopt(socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, ERRORS_HEARD)
             sock.bind((channel,))
         except OSError as error:
             sock.close()

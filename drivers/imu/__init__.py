@@ -1,0 +1,1 @@
+"""IMUs: a codec of drivers.codecs on a wire."""

@@ -12,7 +12,8 @@ from scripted_can import ScriptedMotors, leg
 
 from drivers.bus import BusError, MotorCommand
 from drivers.can_bus import ANSWER_TIME, QUEUE_FULL_TIME, TRIES, CanBus
-from drivers.codecs.damiao import Kind
+from drivers.codecs import damiao
+from drivers.codecs.damiao import Kind, Operation
 from drivers.open import open_bus
 from drivers.wire import ERROR, WireError, WireFull
 
@@ -169,12 +170,64 @@ def test_a_motor_that_stays_enabled_is_refused():
         bus.connect(clock)
 
 
+def test_what_waited_on_the_wire_is_no_answer():
+    bus, wire, clock = made(connect=False)
+    wire.arrive(wire.codec.pack_register(0, Operation.READ, "PMAX", 12.5))
+    wire.silent = {0}
+    with pytest.raises(BusError, match="joint_1 .*no answer on 0x11 to a request for register PMAX"):
+        bus.connect(clock)
+
+
+def test_a_late_echo_of_a_write_does_not_pass_for_reading_back():
+    bus, wire, clock = made(connect=False)
+    asked = {"TIMEOUT": 0}
+
+    def lose(row: int, kind: int) -> bool:
+        """Every request to read TIMEOUT of joint_1 is lost, and the echo of the write arrives instead."""
+        request = damiao.unpack_register(wire.sent[-1]["data"][row]) if kind == Kind.REGISTER else None
+        if row or request is None or request[1:3] != (Operation.READ, "TIMEOUT"):
+            return False
+        wire.arrive(wire.codec.pack_register(0, Operation.WRITE, "TIMEOUT", 1600))
+        asked["TIMEOUT"] += 1
+        return True
+
+    wire.lose = lose
+    with pytest.raises(BusError, match="joint_1 .*no answer on 0x11 to a request for register TIMEOUT"):
+        bus.connect(clock)
+    assert asked["TIMEOUT"] == TRIES
+
+
+def test_connecting_again_does_not_take_an_old_state_for_an_answer():
+    bus, wire, clock = made()
+    bus.poll()
+    bus.read(clock.now())
+    clock.time += 1.0
+    refresh = damiao.RegisterFrame(2, Operation.REFRESH, "", 0)
+    wire.lose = lambda row, kind: (
+        kind == Kind.REGISTER
+        and (
+            row == 1 and damiao.unpack_register(wire.sent[-1]["data"][row if len(wire.sent[-1]) == 3 else 0]) == refresh
+        )
+    )
+    with pytest.raises(BusError, match=r"joint_2 .*no answer on 0x12 to a request for its state") as refused:
+        bus.connect(clock)
+    assert "joint_1" not in str(refused.value)
+
+
 def test_other_traffic_while_connecting_does_no_harm():
     bus, wire, clock = made(connect=False)
-    other = wire.feedback()
-    other["id"] += 0x100
-    wire.arrive(np.concatenate([other, wire.codec.pack_register(0, 0x33, "PMAX", 99.0)]))  # from before: thrown away
+    send = wire.send
+
+    def send_among_others(frames: np.ndarray) -> None:
+        send(frames)
+        others = wire.feedback()
+        others["id"] += 0x100
+        wire.arrive(others)
+        wire.arrive(wire.codec.pack_register(1, Operation.READ, "SN", 99))  # another program asks too
+
+    wire.send = send_among_others
     bus.connect(clock)
+    assert bus.counters.rejected == 3
 
 
 def test_nothing_is_sent_before_connecting():

@@ -148,6 +148,62 @@ def test_register_answers_are_told_from_feedback_on_the_same_identifier(operatio
         assert answer == (1, register, 7, operation == Operation.WRITE)
 
 
+def swap(frames: np.ndarray) -> None:
+    frames[[0, 1]] = frames[[1, 0]]
+
+
+def damage(field: str, row: int, value: object):
+    def change(frames: np.ndarray) -> None:
+        frames[field][row] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "rejected", "position"),
+    [
+        (lambda frames: None, 0, [1, 2, 3]),
+        (swap, 0, [1, 2, 3]),
+        (damage("id", 1, 0x77), 1, [1, np.nan, 3]),
+        (damage("id", 1, 0x13), 1, [1, np.nan, 3]),  # joint_2's payload with joint_3's identifier
+        (damage("length", 1, 7), 1, [1, np.nan, 3]),
+        (damage("data", 1, payload("13 7f ff 7f f7 ff 19 19")), 1, [1, np.nan, 3]),  # says that it is motor 3
+        (damage("data", 1, damiao.pack_register(2, Operation.READ, "SN")), 0, [1, np.nan, 3]),
+        (damage("data", 1, payload("02 00 00 7f f7 ff 19 19")), 0, [1, -12.5, 3]),
+    ],
+)
+def test_as_many_frames_as_motors(change, rejected, position):
+    """The usual tick takes a short way; what only looks like one must not."""
+    zero = np.zeros(3)
+    frames = DamiaoMotors(leg()).pack_feedback(np.array([1.0, 2, 3]), zero, zero, np.ones(3, int), 25, 25)
+    change(frames)
+    state = MotorState.empty(3)
+    assert DamiaoCodec(leg()).unpack(frames, state, 1.0) == rejected
+    np.testing.assert_allclose(state.position, position, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "02 00 00 15 f7 ff 19 19",  # as an answer, byte 2 would be an operation
+        "02 00 33 7f f7 ff 19 19",  # and byte 3 a register: 7f is none, and what a motor at rest says
+        "02 00 34 15 f7 ff 19 19",
+    ],
+)
+def test_feedback_at_the_negative_end_is_no_register_answer(text):
+    codec, state = DamiaoCodec(leg()), MotorState.empty(3)
+    frames = make_frames(np.array([0x12]), payload(text)[None])
+    assert codec.unpack(frames, state, 1.0) == 0
+    assert state.position[1] == pytest.approx(-12.5, abs=0.03)
+    assert codec.unpack_registers(frames) == []
+
+
+def test_a_register_answer_from_nobody_is_none():
+    """Its payload names joint_3, its identifier nobody: another motor was left on a foreign feedback id."""
+    frames = make_frames(np.array([0x77]), damiao.pack_register(3, Operation.READ, "PMAX", 12.5)[None])
+    assert DamiaoCodec(leg()).unpack_registers(frames) == []
+
+
 def test_the_later_of_two_frames_counts():
     codec, motors, state = DamiaoCodec(leg()), DamiaoMotors(leg()), MotorState.empty(3)
     frames = [
