@@ -46,12 +46,18 @@ def pack(model: ModelProto, contract: Contract, path: str | Path, robot: RobotCo
     path = Path(path)
     _anonymise(model)
     onnx.helper.set_model_props(model, {METADATA_KEY: contract.model_dump_json(), **_csv(contract)})
-    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as draft:
-        draft.write(seal(model))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as draft:
+            draft.write(seal(model))
+    except OSError as error:
+        raise PolicyError(f"{path}: {error.strerror}, expected a place to write; choose another with -o") from None
     try:
         load_policy(draft.name, robot or load_robot(contract.robot))
         os.chmod(draft.name, 0o644)
         os.replace(draft.name, path)
+    except PolicyError as error:
+        raise PolicyError(str(error).replace(draft.name, str(path))) from None
     finally:
         Path(draft.name).unlink(missing_ok=True)
     return load_policy(path, trial=0)

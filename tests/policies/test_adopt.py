@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -169,7 +172,7 @@ def test_refusals(case, source, tmp_path, capsys):
     output = tmp_path / "walk.onnx"
     assert cli.main(["adopt", str(source), "--dialect", "unitree_rl_gym", "--robot", "g1", "-o", str(output)]) == 2
     out, err = capsys.readouterr()
-    assert words in err and err.startswith("error: ") and not out
+    assert words in err and err.startswith("error: ") and not out and ".walk.onnx." not in err
     assert [p.name for p in tmp_path.iterdir()] == ["source"]
 
 
@@ -177,6 +180,21 @@ def test_damaged_torchscript(source, tmp_path):
     _truncate(source / "motion.pt")
     with pytest.raises(PolicyError, match="expected a TorchScript policy"):
         walk(source, tmp_path, "motion.pt")
+
+
+def test_nowhere_to_write(source, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(PolicyError, match="expected a place to write"):
+        adopt(source, "unitree_rl_gym", G1, tmp_path / "file" / "walk.onnx")
+
+
+def test_onnx_is_adopted_without_torch(source, tmp_path):
+    """The base installation has none."""
+    program = (
+        "import sys; from sim2real.cli import main; code = main(sys.argv[1:]); sys.exit(code or 'torch' in sys.modules)"
+    )
+    command = ["adopt", str(source), "--dialect", "unitree_rl_gym", "-o", str(tmp_path / "walk.onnx")]
+    subprocess.run([sys.executable, "-c", program, *command], check=True, cwd=Path(__file__).resolve().parents[2])
 
 
 def test_unknown_dialect(tmp_path):

@@ -251,3 +251,23 @@ def test_seal_survives_resealing(good):
     """Sealing is idempotent: the same model gives the same bytes."""
     again = onnx.load_from_string(good)
     assert len(metadata(again)[SEAL_KEY]) == 64 and seal(again) == good
+
+
+def test_deploy_refuses_before_anything_is_opened(good, tmp_path, capfd):
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(good[:-100])
+    command = [
+        "deploy",
+        "--robot",
+        "g1",
+        "--policy",
+        str(path),
+        "--clock",
+        "lockstep",
+        "--record",
+        str(tmp_path / "runs"),
+    ]
+    assert cli.main(command) == 2
+    out, err = capfd.readouterr()
+    assert out == "" and err.startswith("error: ") and "truncated or damaged" in err
+    assert not (tmp_path / "runs").exists()
