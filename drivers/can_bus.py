@@ -87,6 +87,7 @@ class CanBus:
         """
         self._clock = clock
         self._whole = clock.now()
+        self._heard.clear()
         self._receive()  # what others left there
         self._transmit(self._codec.pack_disable(), required=True)
         for check in self._codec.checks:

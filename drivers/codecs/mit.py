@@ -1,4 +1,4 @@
-"""MIT-mode frames (the mini-cheetah packing, bgkatz/motorcontrol ``CAN/CAN_com.cpp``), a whole bus per call, both sides.
+"""MIT-mode frames (the mini-cheetah packing, firmware bgkatz/motorcontrol), a whole bus per call, both sides.
 
 A command is one big-endian 64-bit word, MSB first: position 16 bits, velocity 12, kp 12, kd 12, torque 12.
 A reply is: one byte of the vendor's (motor id, often with an error nibble), position 16, velocity 12, torque 12, two bytes

@@ -51,6 +51,8 @@ def test_a_bus_on_python_can():
         (leg(protocol="damaio"), r"bus leg: got protocol 'damaio' \(did you mean 'damiao'\?\), expected one of damiao"),
         (leg(interface="sockatcan"), r"interface 'sockatcan' \(did you mean 'socketcan'\?\), expected one of sim, .*virtual"),
         (leg(interface="socketcan", channel="nocan99"), "bus leg: socketcan nocan99: "),
+        (leg(interface="sim", channel="/nothing"), "bus leg: /nothing: No such file or directory; expected a simulated robot"),
+        (replace(IMU, interface="sim", channel="/nothing"), "imu: /nothing: No such file or directory"),
         (replace(IMU, protocol="hipnic"), r"imu: got protocol 'hipnic' \(did you mean 'hipnuc'\?\), expected one of hipnuc"),
         (replace(IMU, interface="seriell"), r"imu: got interface 'seriell' \(did you mean 'serial'\?\), expected one of serial, sim"),
     ],
