@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
+from sim2real.clock import tune
+from sim2real.clock import tune
 from sim2real.run import Life, RunSpec, tell
+
+PRIORITY = 60  # below the guardian's and the pilot's
 
 
 def main(directory: Path) -> int:
@@ -27,7 +32,20 @@ def main(directory: Path) -> int:
         joint_pos=dict(zip(config.joint_names, config.home_pos, strict=True)),
     )
     world.advance(SETTLE)
-    serve(world, directory, ready=lambda: tell("ready", ready=True), goes_on=life.goes_on, warn=tell)
+    if spec.tune:  # real motors do not wait for other programs either; the loops have the other core
+        tune(PRIORITY, min(os.sched_getaffinity(0)), spin=0.0)
+    if spec.tune:  # real motors do not wait for a busy computer either
+        tune(75)
+    said = False
+
+    def goes_on() -> bool:
+        nonlocal said
+        if not said:  # only now does anybody listen
+            tell("ready", ready=True)
+            said = True
+        return life.goes_on()
+
+    serve(world, directory, goes_on=goes_on, warn=tell)
     return 0
 
 
