@@ -25,7 +25,7 @@ def rows() -> Iterator[Row]:
     recorded = json.loads((SOURCE / "result.json").read_text())["runs"]["forward_0.5"]["mean_vx_body_after2s"]
     walk = ["--policy", policy, "--skill", "walk", "--velocity", 0.5, 0, 0, "--duration", 20, "--clock", "lockstep"]
     for words, faults in CONDITIONS.items():
-        runs = [deploy(*walk, "--seed", seed, *faults, "--no-record") for seed in SEEDS]
+        runs = [deploy(*walk, "--seed", seed, *faults) for seed in SEEDS]
         falls = sum(run["fell"] or bool(run["faults"]) for run in runs)
         velocities = [run["mean_velocity"][0] if run["mean_velocity"] else 0.0 for run in runs]
         off = max(abs(v / recorded - 1) for v in velocities)
@@ -38,6 +38,13 @@ def rows() -> Iterator[Row]:
             falls == 0 and (bool(faults) or off <= TOLERANCE),
             {"velocities": velocities, "recorded": recorded, "falls": falls},
         )
+
+
+def standing(seconds: float) -> list[object]:
+    """Arguments of ``sim2real deploy`` for a run that stays where it is: the shipped policy, or else the adopted one."""
+    if (ROOT / "policies" / "g1" / "basics.onnx").is_file():
+        return ["--skill", "stand", "--duration", seconds]
+    return ["--policy", adopted(), "--skill", "walk", "--duration", seconds]
 
 
 def adopted() -> Path:
