@@ -152,7 +152,7 @@ class CanBus:
             raise BusError(f"bus {self.spec.name} ({self._where()}): {error}") from error
         error = frames["id"] & ERROR
         if errors := np.count_nonzero(error):
-            self.counters.extra["bus_errors"] += errors
+            self.counters.extra["bus_errors"] += int(errors)
             frames = frames[error == 0]
         return frames
 
