@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 from sim2real.clock import tune
-from sim2real.clock import tune
 from sim2real.run import Life, RunSpec, tell
 
 PRIORITY = 60  # below the guardian's and the pilot's
@@ -34,8 +33,6 @@ def main(directory: Path) -> int:
     world.advance(SETTLE)
     if spec.tune:  # real motors do not wait for other programs either; the loops have the other core
         tune(PRIORITY, min(os.sched_getaffinity(0)), spin=0.0)
-    if spec.tune:  # real motors do not wait for a busy computer either
-        tune(75)
     said = False
 
     def goes_on() -> bool:
