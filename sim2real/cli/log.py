@@ -87,9 +87,8 @@ class ReplayArgs:
         console = Console()
         for note in result.notes:
             console.print(_plain(f"note: {note}", "yellow"))
-        if result.first:
-            rows = [(f"{c.time:.3f}", c.what, c.where, c.was, c.now) for c in result.first]
-            console.print(_table("first changes", ("s", "what", "where", "was", "is now"), rows))
+        for c in result.first:
+            console.print(_plain(f"{c.time:9.3f} s  {c.what} {c.where}: was {c.was}, is now {c.now}"), soft_wrap=True)
         for what, count in result.changed.items():
             largest = f", by up to {result.largest[what]:.3g}" if what in result.largest else ""
             console.print(_plain(f"{what}: changed in {count} ticks{largest}", "red"))
@@ -203,5 +202,5 @@ def _print_summary(console: Console, s) -> None:
         )
         for j in s.joints
     ]
-    head = ("joint", "tracking rad", "margin rad", "torque N m", "of limit", "deg C")
+    head = ("joint", "rmse rad", "margin rad", "N m", "of limit", "deg C")
     console.print(_table("", head, rows))
