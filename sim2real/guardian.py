@@ -82,6 +82,7 @@ class Guardian:
         self.response = self.response_share * period
         self.done = False
         self.record = states.layout.new()
+        self.record["mode"] = Mode.OFF
         self._state = state_view(self.record)
         self._sent = command_view(self.record, "command")
         self._requested = command_view(self.record, "request")
@@ -218,7 +219,8 @@ class Guardian:
         counted = [(b.counters.sent, b.counters.received, b.counters.rejected, b.counters.lost) for b in self.robot.buses]
         r["bus.sent"][0], r["bus.received"][0], r["bus.rejected"][0], r["bus.lost"][0] = zip(*counted, strict=True)
         frames = (r["bus.sent"] + r["bus.received"])[0]
-        r["bus.load"][0] = (frames - self._frames) * self._load if self._tick else 0.0  # not what connecting took
+        if self._tick:  # smoothed over a tenth of a second; without what connecting took
+            r["bus.load"][0] += 10 * self.period * ((frames - self._frames) * self._load - r["bus.load"][0])
         self._frames = frames
         if self.sink is not None:
             self.sink.write(TICK, float(r["time"][0]), r)

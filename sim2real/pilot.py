@@ -58,6 +58,7 @@ class Pilot:
         self.request = requests.layout.new()
         self._state = state_view(states.record)
         self._request_view = command_view(self.request, "command")
+        self._heard = False
         self._tick = 0
 
     def tick(self, scheduled: float, lateness: float = 0.0, late: int = 0) -> None:
@@ -65,11 +66,13 @@ class Pilot:
         clock, player, r = self.clock, self.player, self.record
         start = clock.now()
         if self.states.read():
+            self._heard = True
             self._state.time = float(self.states.record["state.time"][0])
             self._state.imu_age = float(self.states.record["state.imu_age"][0])
         wish = self._wish()
         before = clock.now()
-        command = player.step(self._state, Mode(int(self.states.record["mode"][0])), wish, start)
+        mode = Mode(int(self.states.record["mode"][0])) if self._heard else Mode.OFF
+        command = player.step(self._state, mode, wish, start)
         after = clock.now()
         for name in ("joint_pos", "joint_vel", "joint_torque", "kp", "kd"):
             getattr(self._request_view, name)[:] = getattr(command, name)

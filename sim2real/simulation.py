@@ -141,6 +141,7 @@ class Simulation:
                 running = now
                 self._tell(f"the policy never took over within {self.timeout:g} s")
                 self.guardian.quit()
+        self.clock.sleep_until(self.clock.now() + 0.01)  # the last frames are still on the wire
         summary = self.measures.summary(self.messages, self.player, wire_sha256=world.digest)
         self.robot.close()
         self.operator.close()
