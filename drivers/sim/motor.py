@@ -127,9 +127,7 @@ class SimMotors:
         self._changed = False  # the law is no longer what commands and states make of it
         self._settle = False  # the body still has the mean of two laws
         self._taken: list[tuple[int, float]] = []  # commands (row, time) of this substep
-        self._arrived_rows: list[int] = []
-        self._arrived_raws: list[bytes] = []
-        self._arrived_times: list[float] = []
+        self._arrived: list[tuple[int, bytes, float]] = []  # commands not yet taken over
         self._deadline = np.inf
         self._thermal_due = THERMAL_PERIOD
         self._stale = True
@@ -151,9 +149,7 @@ class SimMotors:
             return None
         answer = self._answer(row)
         if self._accepts[row]:
-            self._arrived_rows.append(row)
-            self._arrived_raws.append(raw[8:])
-            self._arrived_times.append(time)
+            self._arrived.append((row, raw, time))
         return answer
 
     def _receive_rare(self, bus: int, raw: bytes, time: float) -> tuple[int, int, bytes, int] | None:
@@ -263,15 +259,15 @@ class SimMotors:
 
     def _take_commands(self) -> None:
         """The commands that arrived become the motors' targets."""
-        if not self._arrived_rows:
+        if not self._arrived:
             return
-        rows = self._arrived_rows
-        self._data[rows] = np.frombuffer(b"".join(self._arrived_raws), np.uint8).reshape(-1, 8)
-        self.last_command_time[rows] = self._arrived_times
+        rows, raws, times = map(list, zip(*self._arrived, strict=True))
+        self._arrived.clear()
+        self._data[rows] = np.frombuffer(b"".join(raws), FRAME)["data"]
+        self.last_command_time[rows] = times
         self._commanded[rows] = True
-        self._taken += zip(rows, self._arrived_times, strict=True)
+        self._taken += zip(rows, times, strict=True)
         self._changed = True
-        self._arrived_rows, self._arrived_raws, self._arrived_times = [], [], []
         self._set_deadline()
 
     def _decide(self) -> np.ndarray:

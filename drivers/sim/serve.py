@@ -220,7 +220,10 @@ class Server:
             out[name] = port.give(now)
             if port.bridge is not None and out[name]:
                 frames = np.frombuffer(out[name], FRAME)
-                port.bridge.send(frames[frames["id"] & ERROR == 0])
+                try:
+                    port.bridge.send(frames[frames["id"] & ERROR == 0])
+                except WireFull:
+                    self.pace.unread += 1
         for sock, name in list(self._clients.items()):
             if data := out.get(name):
                 self._send(sock, data)

@@ -19,9 +19,22 @@ from drivers.sim.truth import Truth
 from drivers.wire import ERROR, FRAME, WireError, WireFull
 
 DATAGRAM = 1 << 18  # bytes: more than any tick
+ANSWER_TIME = 2.0  # s that a call may take
 # linux/can/error.h: classes are bits of the identifier, CONTROLLER says more in data[1].
 CONTROLLER, BUS_OFF, RESTARTED = 0x04, 0x40, 0x100
 TX_OVERFLOW = 0x02
+
+
+def _connect(path: str, timeout: float) -> socket.socket:
+    """A SEQPACKET socket to ``path``. Raises WireError if nobody listens there."""
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    try:
+        sock.connect(path)
+    except OSError as error:
+        sock.close()
+        raise WireError(f"{path}: {error}; expected a simulated robot there, is it running?") from None
+    sock.settimeout(timeout)
+    return sock
 
 
 class _Socket:
@@ -167,8 +180,8 @@ class WorldRemote:
         self.call("inject", fault=fault)
 
     def truth(self) -> Truth:
-        fields: dict[str, Any] = self.call("truth")
-        return Truth(**{k: np.array(v) if isinstance(v, list) else v for k, v in fields.items()})
+        fields: dict[str, Any] = {k: np.array(v) if isinstance(v, list) else v for k, v in self.call("truth").items()}
+        return Truth(**fields)
 
     @property
     def time(self) -> float:

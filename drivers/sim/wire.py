@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import random
+from bisect import insort
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -85,7 +86,7 @@ class SimCan:
         self._motors, self._latency, self._reply_delay, self._room = motors, latency, reply_delay, queue_length
         self._bit = 1.0 / spec.bitrate
         self._queue: deque[tuple] = deque()  # the host's: (ready, key, id, raw, bits, tries)
-        self._waiting: list[tuple] = []  # heap of answers not ready yet: (ready, key, order, raw, bits, row, tries)
+        self._waiting: deque[tuple] = deque()  # answers to come, sorted: (ready, key, order, raw, bits, row, tries)
         self._contending: list[tuple] = []  # heap of answers that want the wire: (key, order, raw, bits, row, tries)
         self._free = 0.0  # when the wire is idle again
         self._order = 0
@@ -164,8 +165,7 @@ class SimCan:
             if start >= until:
                 return
             while waiting and waiting[0][0] <= start:
-                _, key, order, raw, bits, row, tries = heappop(waiting)
-                heappush(contending, (key, order, raw, bits, row, tries))
+                heappush(contending, waiting.popleft()[1:])
             self._free = start
             if queue and queue[0][0] <= start and (not contending or queue[0][1] < contending[0][0]):
                 _, _, id, raw, bits, tries = queue[0]
@@ -187,7 +187,11 @@ class SimCan:
                     if answer is not None:
                         row, key, reply, bits = answer
                         self._order += 1
-                        heappush(waiting, (end + delay, key, self._order, reply, bits, row, 0))
+                        item = (end + delay, key, self._order, reply, bits, row, 0)
+                        if waiting and waiting[-1] > item:  # behind one that a fault holds back
+                            insort(waiting, item)
+                        else:
+                            waiting.append(item)
             else:
                 _, _, raw, bits, row, tries = contending[0]
                 end = start + bits * bit
@@ -283,12 +287,12 @@ class SimCan:
             elif fault.kind == "duplicate":
                 copies = 2
             elif fault.kind == "delay" and tries == 0:
-                heappush(self._waiting, (start + fault.value, key, self._order, raw, bits, row, 1))
+                insort(self._waiting, (start + fault.value, key, self._order, raw, bits, row, 1))
                 return None, raw
             elif fault.kind == "corrupt":
                 self._break_off(start, bits)
                 if tries < BUS_OFF_TRIES:
-                    heappush(self._waiting, (self._free, key, self._order, raw, bits, row, tries + 1))
+                    insort(self._waiting, (self._free, key, self._order, raw, bits, row, tries + 1))
                 return None, raw
             elif fault.kind in FEEDBACK:
                 raw = self._lie(fault, row, raw)
@@ -312,9 +316,8 @@ class SimCan:
 
     def forget(self, row: int) -> None:
         """A motor lost its power: what it wanted to say is gone."""
-        self._waiting = [w for w in self._waiting if w[5] != row]
+        self._waiting = deque(w for w in self._waiting if w[5] != row)
         self._contending = [c for c in self._contending if c[4] != row]
-        heapify(self._waiting)
         heapify(self._contending)
 
     def digest(self, sha: hashlib._Hash) -> None:

@@ -174,6 +174,15 @@ def test_delay(tmp_path):
     assert late == pytest.approx(plain + 2 * 0.003, abs=1e-9)
 
 
+def test_an_answer_held_back_does_not_hold_back_others(tmp_path):
+    host = faulty(tmp_path, "delay:arm/left=0.003")
+    host.send((REGISTER, REFRESH))
+    assert len(host.wait(0.004)) == 0  # its answer is due at 6.5 ms
+    host.send((REGISTER, OTHER))
+    assert [id for id, _ in answers(host.wait(0.001))] == [0x12]
+    assert [id for id, _ in answers(host.wait(0.002))] == [0x11]
+
+
 def test_corrupt_frames_are_sent_again(tmp_path):
     host = faulty(tmp_path, "corrupt:0.08")  # more would take the host off the bus: +8 for a failure, -1 for a success
     assert len(tell(host)) == 200  # nothing is lost,
