@@ -13,7 +13,6 @@ MODULES = {"pickle", "cPickle", "joblib", "dill", "cloudpickle", "marshal", "she
 CALLS = {
     "eval": "runs text",
     "exec": "runs text",
-    "compile": "runs text",
     "__import__": "write import_module and a table",
     "yaml.load": "use yaml.safe_load",
     "yaml.unsafe_load": "use yaml.safe_load",
