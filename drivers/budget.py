@@ -108,7 +108,7 @@ def _plain_bits(ids: np.ndarray, data: np.ndarray) -> np.ndarray:
     entries = np.empty_like(chunks)
     state: np.ndarray | int = START
     for chunk, entry in zip(chunks, entries, strict=True):
-        stuffing.take(chunk | state, out=entry)
+        stuffing.take(chunk | state, out=entry, mode="clip")  # never out of range; "raise" would copy twice
         state = entry & -CHUNK
     return (entries & (CHUNK - 1)).sum(axis=0) + (7 * CHUNK_BITS + TAIL_BITS)
 
