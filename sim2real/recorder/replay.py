@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sim2real.config import RobotConfig
-from sim2real.policy import Policy, load_policy
+from sim2real.contract import Contract
+from sim2real.policy import Policy, load_policy, read_contract
 from sim2real.recorder.run import Run, rule_name
 from sim2real.recorder.summary import mode_name
 from sim2real.records import Calls, command_view, state_view
@@ -142,7 +142,7 @@ def _policy_changes(
     recorded, policies = _policies(run, robot, files)
     current, since = -1, -np.inf  # policy that runs; when the blend from another one's targets began
     before = blend_from = np.zeros(len(robot.joint_names))
-    first_label = np.cumsum([0, *(len(p.contract.skills) for p in recorded)])
+    first_label = np.cumsum([0, *(len(contract.skills) for contract in recorded)])
     for row, time in zip(run.pilot, run.pilot_time.tolist(), strict=True):
         index = int(row["policy"]) if row["stage"] == Stage.RUN else -1
         target, now = row["command.joint_pos"], float(row["command.time"])
@@ -154,7 +154,7 @@ def _policy_changes(
                 policy.reset()
                 since = now if current >= 0 else -np.inf
                 blend_from = before
-            prefix = f"input.{recorded[index].contract.name}."
+            prefix = f"input.{recorded[index].name}."
             inputs = {name: row[prefix + name] for name in policy.signals}
             if all(np.isfinite(x).all() for x in inputs.values()):
                 outputs = policy.step(inputs)
@@ -182,7 +182,7 @@ class _Runnable(NamedTuple):
     signals: tuple[str, ...]
 
     @property
-    def contract(self):
+    def contract(self) -> Contract:
         return self.policy.contract
 
     def reset(self) -> None:
@@ -192,37 +192,40 @@ class _Runnable(NamedTuple):
         return self.policy.step(inputs)
 
 
-def _policies(run: Run, robot: RobotConfig, files: Sequence[Path]) -> tuple[list[_Runnable], list[_Runnable]]:
-    """The recorded policies, and those to run: ``files`` or the same. Raises Sim2realError where they do not match."""
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        recorded = []
-        for i, content in enumerate(c for name, c in run.reader.attachments.items() if name.endswith(".onnx")):
-            path = folder / f"{i}.onnx"
-            path.write_bytes(content)
-            recorded.append(_runnable(load_policy(path, robot)))
-    if not recorded:
-        raise Sim2realError(f"{run.path}: no policy file in the record; its policy cannot be replayed")
-    if not files:
-        return recorded, recorded
-    if len(files) != len(recorded):
-        raise Sim2realError(
-            f"--policy: got {len(files)} files, expected {len(recorded)}, one for each policy of the run"
-        )
-    replaced = [_runnable(load_policy(path, robot)) for path in files]
-    for old, new, path in zip(recorded, replaced, files, strict=True):
-        for what in ("joint_names", "skill_labels", "period"):
-            got, expected = getattr(new.contract, what), getattr(old.contract, what)
-            if got != expected:
-                raise Sim2realError(
-                    f"{path}: {what}: got {got}, expected {expected} as in the recorded '{old.contract.name}';"
-                    " only a policy that sees the same can be compared"
-                )
-        if strangers := [n for n in new.signals if n not in old.signals]:
+def _policies(run: Run, robot: RobotConfig, files: Sequence[Path]) -> tuple[list[Contract], list[_Runnable]]:
+    """What the recorded policies say of themselves, and those to run: ``files``, or the recorded ones.
+
+    Raises Sim2realError where they do not match."""
+    with tempfile.TemporaryDirectory() as folder:
+        kept = []
+        for content in (c for name, c in run.reader.attachments.items() if name.endswith(".onnx")):
+            kept.append(Path(folder) / f"{len(kept)}.onnx")
+            kept[-1].write_bytes(content)
+        if not kept:
+            raise Sim2realError(f"{run.path}: no policy file in the record; its policy cannot be replayed")
+        if files and len(files) != len(kept):
             raise Sim2realError(
-                f"{path}: inputs {', '.join(strangers)} were not recorded; the run has {', '.join(old.signals)}"
+                f"--policy: got {len(files)} files, expected {len(kept)}, one for each policy of the run"
             )
-    return recorded, replaced
+        recorded = [read_contract(path) for path in kept]
+        for old, path in zip(recorded, files, strict=False):
+            _comparable(path, read_contract(path), old)
+        return recorded, [_runnable(load_policy(path, robot)) for path in files or kept]
+
+
+def _comparable(path: Path, new: Contract, old: Contract) -> None:
+    """Raise Sim2realError unless ``new`` can be fed what ``old`` was fed."""
+    for what in ("joint_names", "skill_labels", "period"):
+        got, expected = getattr(new, what), getattr(old, what)
+        if got != expected:
+            raise Sim2realError(
+                f"{path}: {what}: got {got}, expected {expected} as in the recorded '{old.name}';"
+                " only a policy that sees the same can be compared"
+            )
+    if strangers := [n for n in new.inputs if n not in old.inputs and n not in new.carry]:
+        raise Sim2realError(
+            f"{path}: inputs {', '.join(strangers)} were not recorded; the run has {', '.join(old.inputs)}"
+        )
 
 
 def _runnable(policy: Policy) -> _Runnable:

@@ -134,6 +134,7 @@ def faults(modes: list[Period]) -> list[str]:
 
 
 def mode_name(mode: int) -> str:
+    """``RUN`` ... ``OFF``."""
     return Mode(mode).name if mode in tuple(Mode) else f"mode {mode}"
 
 

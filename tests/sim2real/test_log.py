@@ -365,7 +365,6 @@ def test_another_policy_changes_targets(record, tiny, tmp_path, capsys):
     other = tiny_policy.write(tmp_path / "other.onnx", graph, document)
     code, out, _ = log(capsys, "replay", record, "--policy", other)
     assert code == 1 and re.search(r"joint_pos_target: changed in \d+ ticks, by up to 0.5", out)
-    assert log(capsys, "replay", record, "--policy", tiny)[0] == 0
     code, _, err = log(capsys, "replay", record, "--policy", tiny, other)
     assert code == 2 and "got 2 files, expected 1" in err
     document["skills"] = [{"label": "sit"}]
