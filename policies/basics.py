@@ -49,10 +49,11 @@ class Basics:
     robot: str = "g1"
     seed: int = 1
     envs: int = 512
-    threads: int = 1  # of the physics; the networks have one more
+    threads: int = 2  # of the physics; the networks have one more
     # the policy
     period: float = 0.02  # s
     hidden: tuple[int, ...] = (256, 128)
+    driven: tuple[str, ...] = ("leg", "waist")  # groups of joints that actions move; the rest follows its reference
     action_ratio: float = 0.25  # action 1 moves the target by this share of torque / kp
     action_max: float = 6.0
     # An ankle strategy to start from, in the manner of a person standing: ankle targets move by offset rad, against the
@@ -74,12 +75,11 @@ class Basics:
     # the learner
     horizon: int = 24  # ticks per iteration
     learning_rate: tuple[float, float] = (5e-4, 1e-4)  # from, to; annealed over the run
-    samples: float = 12e6
-    normalise_until: float = 0.5e6  # samples after which the observation normaliser is frozen
+    samples: float = 6e6
     gamma: float = 0.98
     ppo: dict[str, float | int | str | bool] = field(
         default_factory=lambda: {
-            "num_learning_epochs": 5,
+            "num_learning_epochs": 4,
             "num_mini_batches": 12,
             "clip_param": 0.2,
             "lam": 0.95,
@@ -90,7 +90,7 @@ class Basics:
             "use_clipped_value_loss": False,
         }
     )
-    std: float = 0.35  # of the actions at the start
+    std: float = 0.25  # of the actions at the start
     # checkpoints and evaluation, in iterations
     save_every: int = 100
     evaluate_every: int = 50

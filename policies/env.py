@@ -38,7 +38,7 @@ class Env(VecEnv):
         self.rng = np.random.default_rng(seed)
         self.script, self.level, self.adaptive = script, level, script is None
         self.num_envs = n = config.envs if script is None else len(script)
-        self.num_actions = joints = len(self.graph.joint_names)
+        self.num_actions, joints = len(self.graph.driven), len(self.graph.joint_names)
         self.max_episode_length = round(config.episode / config.period)
         self.episode_length_buf = torch.zeros(n, dtype=torch.long)
         self.model = training_model(load_robot(config.robot), self.graph.kp, self.graph.kd, config.timestep)
@@ -54,7 +54,7 @@ class Env(VecEnv):
         labels = len(self.graph.labels)
         self.skill, self.carry_skill = torch.zeros(n, labels), torch.zeros(n, labels)
         self.phase, self.reference = torch.zeros(n, 1), torch.zeros(n, joints)
-        self.action, self.target = torch.zeros(n, joints), torch.zeros(n, joints)
+        self.action, self.target = torch.zeros(n, self.num_actions), torch.zeros(n, joints)
         self._switch_in, self._push_in = np.zeros(n, np.int64), np.zeros(n, np.int64)
         self.observation = torch.zeros(0)
         self.reset()
@@ -65,7 +65,7 @@ class Env(VecEnv):
         return TensorDict({"policy": self.observation}, batch_size=[self.num_envs])
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
-        """``actions`` (envs, n) -> observations, rewards (envs,), dones (envs,), extras. Failed and finished episodes
+        """``actions`` (envs, driven) -> observations, rewards (envs,), dones (envs,), extras. Failed and finished episodes
         start anew; the observation returned is then the new episode's first."""
         self._act(actions.detach())
         tick = self._tick(self._last_action)
@@ -136,8 +136,10 @@ class Env(VecEnv):
         n, rng, drawn = self.num_envs, self.rng, self.random.drawn
         newest = self.substeps - 1 - np.floor(drawn["state_delay"][:, 0]).astype(int)
         qpos, qvel = (self._recorded[f][np.arange(n), newest] for f in ("qpos", "qvel"))
-        joint_pos = qpos[:, 7:] + drawn["joint_offset"] + drawn["joint_pos_noise"] * rng.standard_normal((n, 29))
-        joint_vel = qvel[:, 6:] + drawn["joint_vel_noise"] * rng.standard_normal((n, 29))
+        joint_pos = (
+            qpos[:, 7:] + drawn["joint_offset"] + drawn["joint_pos_noise"] * rng.standard_normal((n, self.model.nu))
+        )
+        joint_vel = qvel[:, 6:] + drawn["joint_vel_noise"] * rng.standard_normal((n, self.model.nu))
         gyro = qvel[:, 3:6] + drawn["gyro_noise"] * rng.standard_normal((n, 3))
         tilt = drawn["imu_tilt"] + drawn["gravity_noise"] * rng.standard_normal((n, 2))
         orientation = multiply(qpos[:, 3:7], np.column_stack([np.ones(n), tilt / 2, np.zeros(n)]))

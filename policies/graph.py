@@ -23,6 +23,7 @@ class PolicyGraph(nn.Module):
     """
 
     scale: Tensor
+    drive: Tensor
     ankles: Tensor
     lower: Tensor
     upper: Tensor
@@ -44,7 +45,11 @@ class PolicyGraph(nn.Module):
             config.reference_pull,
         )
         margin = config.position_margin
-        self.register_buffer("scale", _buffer(config.action_ratio * robot.torque_max / robot.home_kp))
+        groups = {j.name: j.group for j in robot.joints}
+        self.driven = [k for k, name in enumerate(robot.joint_names) if groups[name] in config.driven]
+        scale = config.action_ratio * robot.torque_max / robot.home_kp
+        self.register_buffer("scale", _buffer(np.where([groups[n] in config.driven for n in groups], scale, 0.0)))
+        self.register_buffer("drive", torch.diag(self.scale)[self.driven])  # actions to joints
         self.register_buffer("lower", _buffer(robot.position_min + margin))
         self.register_buffer("upper", _buffer(robot.position_max - margin))
         ankles = ["ankle_pitch" in name for name in robot.joint_names]
@@ -58,12 +63,12 @@ class PolicyGraph(nn.Module):
         return self.references.home
 
     def target(self, signals: Signals, action: Tensor) -> Tensor:
-        """Joint targets (N, n) rad for a clipped ``action`` (N, n)."""
+        """Joint targets (N, n) rad for a clipped ``action`` (N, driven)."""
         config = self.config
         pitch = gravity_in_base(signals.orientation_base_in_world)[:, 0:1]  # sine of the forward lean
         pitch_rate = signals.angular_velocity_base_in_base[:, 1:2]
         ankle = config.balance_offset + config.balance_gain * pitch + config.balance_damping * pitch_rate
-        target = signals.reference + self.ankles * ankle + self.scale * action
+        target = signals.reference + self.ankles * ankle + action @ self.drive
         return torch.minimum(torch.maximum(target, self.lower), self.upper)
 
     def clip(self, action: Tensor) -> Tensor:
@@ -90,21 +95,21 @@ class PolicyGraph(nn.Module):
             "carry_phase": [1],
             "carry_skill": [labels],
             "carry_reference": [n],
-            "carry_action": [n],
+            "carry_action": [len(self.driven)],
         }
 
     def outputs(self) -> dict[str, list[int]]:
         """Every output by name with its shape, without the batch axis, in the order of ``forward``."""
         n, labels = len(self.joint_names), len(self.labels)
-        size = 3 + 3 + 3 * n + labels + 2 + n
+        size = 3 + 3 + 2 * n + len(self.driven) + labels + 2 + n
         return {
             "joint_pos_target": [n],
             "carry_phase_next": [1],
             "carry_skill_next": [labels],
             "carry_reference_next": [n],
-            "carry_action_next": [n],
+            "carry_action_next": [len(self.driven)],
             "observation": [size],
-            "action": [n],
+            "action": [len(self.driven)],
             "skill_value": [labels],
         }
 

@@ -29,18 +29,28 @@ def gravity_in_base(orientation_base_in_world: Tensor) -> Tensor:
     return torch.stack([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1], dim=-1)
 
 
-TERMS: dict[str, Callable[[Signals], Tensor]] = {
-    "gravity_in_base": lambda s: gravity_in_base(s.orientation_base_in_world),
-    "angular_velocity_base_in_base": lambda s: s.angular_velocity_base_in_base,
-    "joint_pos": lambda s: s.joint_pos - s.home,
-    "joint_vel": lambda s: s.joint_vel,
-    "last_action": lambda s: s.last_action,
-    "skill": lambda s: s.skill,
-    "phase": lambda s: torch.cat([torch.sin(2 * torch.pi * s.phase), torch.cos(2 * torch.pi * s.phase)], dim=-1),
-    "reference": lambda s: s.reference - s.home,
+class Term(NamedTuple):
+    """One part of the observation. ``scale`` brings it to about 1; ``kind`` says how it turns over in a mirror."""
+
+    scale: float
+    kind: str  # vector, axial, joints, actions or same
+    term: Callable[[Signals], Tensor]
+
+
+TERMS: dict[str, Term] = {
+    "gravity_in_base": Term(5.0, "vector", lambda s: gravity_in_base(s.orientation_base_in_world)),
+    "angular_velocity_base_in_base": Term(1.0, "axial", lambda s: s.angular_velocity_base_in_base),
+    "joint_error": Term(5.0, "joints", lambda s: s.joint_pos - s.reference),
+    "joint_vel": Term(0.3, "joints", lambda s: s.joint_vel),
+    "last_action": Term(1.0, "actions", lambda s: s.last_action),
+    "skill": Term(1.0, "same", lambda s: s.skill),
+    "phase": Term(
+        1.0, "same", lambda s: torch.cat([torch.sin(2 * torch.pi * s.phase), torch.cos(2 * torch.pi * s.phase)], -1)
+    ),
+    "reference": Term(1.0, "joints", lambda s: s.reference - s.home),
 }
 
 
 def observe(signals: Signals) -> Tensor:
-    """The observation (N, size): every term of TERMS, in that order. Scaling is the network's normaliser."""
-    return torch.cat([term(signals) for term in TERMS.values()], dim=-1)
+    """The observation (N, size): every term of TERMS times its scale, in that order."""
+    return torch.cat([scale * term(signals) for scale, _, term in TERMS.values()], dim=-1)

@@ -80,8 +80,7 @@ TABLE: dict[str, Term] = {
     "kp": Term(0.9, 1.1, "joints", "x: torque constants differ by some 10 %", _kp),
     "kd": Term(0.8, 1.2, "joints", "x: velocity is estimated in the motor", _kd),
     "strength": Term(0.9, 1.0, "joints", "x: hot windings, sagging battery", _strength),
-    "frictionloss": Term(0.5, 2.0, "joints", "x 0.1 N m: gears", _scale("dof_frictionloss", _joints)),
-    "damping": Term(0.0, 30.0, "joints", "x 0.01 N m s/rad: grease", _scale("dof_damping", _joints)),
+    "damping": Term(5.0, 40.0, "joints", "x 0.01 N m s/rad: grease, and dry friction", _scale("dof_damping", _joints)),
     "armature": Term(0.9, 1.1, "joints", "x: rotor inertias are catalogue values", _scale("dof_armature", _joints)),
     # the sensors
     "joint_offset": Term(-0.02, 0.02, "joints", "rad: calibration"),
@@ -97,7 +96,7 @@ TABLE: dict[str, Term] = {
 }
 
 EXPANDED = ("geom_friction", "body_mass", "body_inertia", "body_ipos", "actuator_gainprm", "actuator_biasprm",
-            "actuator_forcerange", "dof_frictionloss", "dof_damping", "dof_armature")  # fmt: skip
+            "actuator_forcerange", "dof_damping", "dof_armature")  # fmt: skip
 
 
 class Randomisation:

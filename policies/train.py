@@ -11,15 +11,18 @@ import subprocess
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
 from torch import nn
 
 from policies.basics import Basics
 from policies.env import Env
 from policies.evaluate import quick_survival
 from policies.graph import PolicyGraph
+from policies.mirror import Mirrored, Turn, action_mirror, observation_mirror
 from sim2real.types import Sim2realError
 
 Report = Callable[[dict[str, float]], None]
@@ -146,18 +149,27 @@ class Training:
         }
 
 
+class MirroredModel(MLPModel):
+    """rsl_rl's network, made symmetric."""
+
+    def __init__(self, *args: Any, observation_mirror: Turn, output_mirror: Turn, **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        self.mlp = Mirrored(self.mlp, observation_mirror, output_mirror)
+
+
 def make_ppo(config: Basics, env: Env, rank: int = 0, world: int = 1) -> PPO:
     """rsl_rl's PPO with one observation for actor and critic (the exported critic sees what the actor sees)."""
-    network = {"class_name": "MLPModel", "hidden_dims": list(config.hidden), "activation": "elu",
-               "obs_normalization": True}  # fmt: skip
+    network = {"class_name": MirroredModel, "hidden_dims": list(config.hidden), "activation": "elu",
+               "observation_mirror": observation_mirror(env.graph)}  # fmt: skip
     settings = {
         "num_steps_per_env": config.horizon,
         "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
         "actor": {
             **network,
+            "output_mirror": action_mirror(env.graph),
             "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": config.std, "std_type": "scalar"},
         },
-        "critic": dict(network),
+        "critic": {**network, "output_mirror": ([0], [1.0])},
         "algorithm": {
             "class_name": "PPO",
             "gamma": config.gamma,
@@ -168,18 +180,16 @@ def make_ppo(config: Basics, env: Env, rank: int = 0, world: int = 1) -> PPO:
     }
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
         ppo: PPO = PPO.construct_algorithm(env.get_observations(), env, settings, "cpu")
-    for model in (ppo.actor, ppo.critic):
-        model.obs_normalizer.until = config.normalise_until
     with torch.no_grad():
-        last = [m for m in ppo.actor.mlp if isinstance(m, nn.Linear)][-1]
+        last = [m for m in ppo.actor.mlp.modules() if isinstance(m, nn.Linear)][-1]
         last.weight.mul_(0.01)  # start at the reference pose
         last.bias.zero_()
     return ppo
 
 
 def networks(ppo: PPO) -> tuple[nn.Module, nn.Module]:
-    """Actor and critic as plain modules: normaliser, then the network's mean."""
-    return tuple(nn.Sequential(m.obs_normalizer, m.mlp) for m in (ppo.actor, ppo.critic))  # type: ignore[return-value]
+    """Actor and critic as plain modules from observation to mean action and to value."""
+    return ppo.actor.mlp, ppo.critic.mlp
 
 
 def load_graph(folder: Path, name: str = "best.pt") -> PolicyGraph:

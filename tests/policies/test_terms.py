@@ -13,7 +13,7 @@ from policies.observations import TERMS, Signals, gravity_in_base, observe
 from policies.rewards import REWARDS, Tick, reward
 from policies.terminations import TERMINATIONS, failed
 
-N, JOINTS, LABELS = 5, 29, 4
+N, JOINTS, LABELS, DRIVEN = 5, 29, 4, 15
 
 
 def signals(seed: int = 0) -> Signals:
@@ -21,7 +21,7 @@ def signals(seed: int = 0) -> Signals:
     random = lambda k: torch.randn(N, k, generator=g)  # noqa: E731
     orientation = torch.nn.functional.normalize(random(4), dim=-1)
     return Signals(random(JOINTS), random(JOINTS), orientation, random(3), torch.eye(LABELS)[[0, 1, 2, 3, 0]],
-                   torch.zeros(JOINTS), torch.rand(N, 1, generator=g), random(JOINTS), random(JOINTS))  # fmt: skip
+                   torch.zeros(JOINTS), torch.rand(N, 1, generator=g), random(JOINTS), random(DRIVEN))  # fmt: skip
 
 
 def tick(**changes: np.ndarray) -> Tick:
@@ -34,7 +34,7 @@ def tick(**changes: np.ndarray) -> Tick:
 
 @pytest.mark.parametrize("name", TERMS)
 def test_observation_term_is_a_finite_row_per_robot(name):
-    value = TERMS[name](signals())
+    value = TERMS[name].term(signals())
     assert value.shape[0] == N and value.ndim == 2 and torch.isfinite(value).all()
 
 

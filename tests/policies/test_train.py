@@ -50,7 +50,7 @@ def test_a_run_leaves_its_config_and_curve(tmp_path):
     curve = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
     assert curve == rows and [r["samples"] for r in curve] == [32, 64, 96, 128]
     graph = load_graph(tmp_path, "last.pt")
-    assert graph.actor(torch.zeros(1, *graph.outputs()["observation"])).shape == (1, 29)
+    assert graph.actor(torch.zeros(1, *graph.outputs()["observation"])).shape == (1, 15)
 
 
 def test_no_checkpoint_is_refused_with_the_next_step(tmp_path):
