@@ -98,7 +98,7 @@ class SimMotors:
         self.bus_names = [b.name for b in buses for _ in b.motors]
         n = len(self.specs)
         self._body, self._frame_bits, self._wrap = body, frame_bits, wrap
-        self._hosts = [damiao.DamiaoMotors(b) for b in buses]  # one for each bus: whom a frame is for
+        self._decoders = [damiao.DamiaoMotors(b) for b in buses]  # one for each bus: whom a frame is for
         self._bus_of = np.repeat(np.arange(len(buses)), [len(b.motors) for b in buses])
         self._first = [int(np.flatnonzero(self._bus_of == i)[0]) for i in range(len(buses))]
         self._all = replace(buses[0], name="all", motors=self.specs)
@@ -110,6 +110,8 @@ class SimMotors:
         factory = damiao.ranges_of(self.specs)
         self._flash = [_factory_registers(m, factory, i) for i, m in enumerate(self.specs)]
         for joint, changes in (registers or {}).items():
+            if joint not in self.joints:
+                raise BusError(f"registers: got joint '{joint}', expected one of {', '.join(self.joints)}")
             self._flash[self.joints.index(joint)].update(changes)
 
         self.log: list[MotorEvent] = []
@@ -143,9 +145,7 @@ class SimMotors:
         row = self._rows[bus].get(id)
         if row is None or raw[8:15] == MAGIC_PREFIX or raw[4] != 8:
             return self._receive_rare(bus, raw, time)
-        if not self.powered[row]:
-            return None
-        if not self._obeys_mit[row]:
+        if not (self.powered[row] and self._obeys_mit[row]):
             return None
         answer = self._answer(row)
         if self._accepts[row]:
@@ -155,7 +155,7 @@ class SimMotors:
     def _receive_rare(self, bus: int, raw: bytes, time: float) -> tuple[int, int, bytes, int] | None:
         """Everything but a command."""
         frame = np.frombuffer(raw, FRAME)
-        rows, kinds = self._hosts[bus].classify(frame)
+        rows, kinds = self._decoders[bus].classify(frame)
         row, kind = int(rows[0]) + self._first[bus], int(kinds[0])
         if rows[0] < 0 or not self.powered[row] or kind in (Kind.COMMAND, Kind.OTHER_MODE):
             return None
@@ -328,8 +328,9 @@ class SimMotors:
     def _set_enabled(self, row: int, on: bool, time: float, event: str) -> None:
         self.enabled[row] = on
         self._stale = True
+        self._commanded[row] = False
         if not on:
-            self._commanded[row] = False
+            self._arrived = [a for a in self._arrived if a[0] != row]
             self._effect[row] = OFF
             self._changed = True
         self._accepts[row] = on

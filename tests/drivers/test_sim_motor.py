@@ -219,10 +219,51 @@ def test_command_and_special_in_one_burst_keep_their_order(host):
     assert host.world.plant.joint_torque == pytest.approx([3.0, 0.0], abs=0.02)
 
 
+def test_an_old_command_does_not_survive_a_stop(host):
+    host.ask(1, ENABLE)
+    host.command(torque=2.0, ids=(1,))
+    host.wait(0.004)
+    host.ask(1, DISABLE)
+    host.ask(1, ENABLE)
+    host.wait(0.02)
+    assert host.world.plant.joint_torque[0] == 0.0
+
+
+def test_a_command_too_late_for_the_watchdog_does_nothing(host):
+    """It arrives in the very substep in which the watchdog trips, whatever the phase between the two."""
+    set_register(host, 9, struct.pack("<I", 400))  # 20 ms, looked at in every substep of 2 ms
+    outcomes = set()
+    for gap in np.arange(0.019, 0.025, 0.0005):
+        host.ask(1, CLEAR)
+        host.ask(1, ENABLE)
+        host.command(torque=1.0, ids=(1,))
+        sent = host.world.time
+        host.wait(gap)
+        host.command(torque=2.0, ids=(1,))
+        host.wait(0.004)
+        kept = error_of(host) == 1
+        outcomes.add(kept)
+        assert host.world.plant.joint_torque[0] == pytest.approx(2.0 if kept else 0.0, abs=0.02)
+        assert (host.world.last_command_times()["left"] > sent + 0.01) == kept
+        host.ask(1, CLEAR)
+        host.ask(1, ENABLE)
+        host.wait(0.01)
+        assert kept or host.world.plant.joint_torque[0] == 0.0
+        host.ask(1, DISABLE)
+    assert outcomes == {True, False}
+
+
 def test_set_zero(tmp_path):
     host = Host(make_world(tmp_path, joint_pos={"left": 0.7}))
     host.ask(1, SET_ZERO)
     assert host.ask(REGISTER, REFRESH) == [(0x11, REST.format(0, 1))]
+    host.ask(1, ENABLE)
+    host.command(position=1.0, kp=20.0, kd=1.0, ids=(1,))
+    host.wait(2.0)
+    assert host.world.plant.joint_pos[0] == pytest.approx(1.7, abs=2e-3)  # zero velocity and torque are half a code off
+    host.ask(1, SET_ZERO)  # here is 0 now, so the same target is 1 rad further on, without a new command
+    host.wait(2.0)
+    assert host.world.plant.joint_pos[0] == pytest.approx(2.7, abs=2e-3)
 
 
 def test_power_cycle_loses_turns_and_unsaved_registers(tmp_path):
