@@ -87,6 +87,8 @@ class Status:
 def print_summary(console: Console, summary: Any) -> None:
     """The outcome of a run, a line per fact."""
     table = Table.grid(padding=(0, 2))
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
 
     def row(name: str, value: str, style: str = "") -> None:
         table.add_row(Text(name, style="dim"), Text(value, style=style))

@@ -101,7 +101,6 @@ class Launch:
 
     config: RobotConfig
     player: SkillPlayer
-    policy_paths: Sequence[Path]
     operator: Operator
     wiring: str = ""
     simulated: bool = True
@@ -123,7 +122,7 @@ class Launch:
             robot=str(self.config.path.absolute()),
             wiring=self.wiring,
             simulated=self.simulated,
-            policies=[str(Path(p).absolute()) for p in self.policy_paths],
+            policies={str(p.path.absolute()): p.sha256 for p in self.player.policies},
             tune=self.tune,
             recorder=inherit,
             seed=self.seed,

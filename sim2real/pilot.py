@@ -111,7 +111,7 @@ def main(directory: Path) -> int:
     life = Life()
     spec = RunSpec.load(directory)
     config, wiring = spec.open()
-    player = SkillPlayer(config, [load_policy(Path(p), config, trial=0) for p in spec.policies])
+    player = SkillPlayer(config, [load_policy(p, config, sha, trial=0) for p, sha in spec.policies.items()])
     joints = config.joint_names
     pilot = Pilot(
         player,

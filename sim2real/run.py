@@ -30,7 +30,7 @@ class RunSpec(Strict):
     robot: str  # path of the YAML
     wiring: str
     simulated: bool
-    policies: list[str]  # paths
+    policies: dict[str, str]  # path -> sha256 of the file that was proved before the run
     tune: bool = True  # ask the kernel for punctuality
     recorder: int = -1  # file descriptor of the recorder's channel, inherited; -1: no record
     seed: int = 0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -29,6 +30,8 @@ class Runnable(Protocol):
     """What a SkillPlayer needs of a policy (``sim2real.policy.Policy``)."""
 
     contract: Contract
+    path: Path
+    sha256: str
 
     def reset(self) -> None: ...
 

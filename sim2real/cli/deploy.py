@@ -234,7 +234,6 @@ def _realtime(args, config, player, policies, paths, operator, record, console):
             launch = Launch(
                 config,
                 player,
-                paths,
                 operator,
                 args.wiring,
                 simulated=not args.hardware,

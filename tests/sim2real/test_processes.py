@@ -36,7 +36,7 @@ def launch(tmp_path):
     robot = load_robot("g1")
     file = tiny_policy.write(tmp_path / "tiny.onnx", tiny_policy.model(robot), tiny_policy.document(robot))
     player = SkillPlayer(robot, [load_policy(file, robot, trial=0)])
-    return Launch(robot, player, [file], ScriptOperator([Step("stand", 60.0)]), gantry=False, timeout=20.0)
+    return Launch(robot, player, ScriptOperator([Step("stand", 60.0)]), gantry=False, timeout=20.0)
 
 
 def when_running(launch, act, after: float = 0.3):
@@ -117,7 +117,7 @@ shown = []
 def show(launch):
     print(json.dumps({{"mode": launch.mode.name, "directory": str(launch.directory),
                        "pids": {{k: c.process.pid for k, c in launch.children.items()}}}}), flush=True)
-Launch(robot, player, [file], ScriptOperator([Step("stand", 60.0)]), gantry=False, timeout=20.0, show=show).run()
+Launch(robot, player, ScriptOperator([Step("stand", 60.0)]), gantry=False, timeout=20.0, show=show).run()
 """
 
 
@@ -163,6 +163,6 @@ def test_a_robot_that_is_not_there_is_refused_and_nothing_moves(tmp_path):
     robot = load_robot("g1")
     file = tiny_policy.write(tmp_path / "tiny.onnx", tiny_policy.model(robot), tiny_policy.document(robot))
     player = SkillPlayer(robot, [load_policy(file, robot, trial=0)])
-    launch = Launch(robot, player, [file], ScriptOperator([Step("stand", 1.0)]), simulated=False)
+    launch = Launch(robot, player, ScriptOperator([Step("stand", 1.0)]), simulated=False)
     with pytest.raises(Sim2realError, match="can0"):
         launch.run()
