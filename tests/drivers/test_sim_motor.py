@@ -263,7 +263,7 @@ def test_set_zero(tmp_path):
     assert host.world.plant.joint_pos[0] == pytest.approx(1.7, abs=2e-3)  # zero velocity and torque are half a code off
     host.ask(1, SET_ZERO)  # here is 0 now, so the same target is 1 rad further on, without a new command
     host.wait(2.0)
-    assert host.world.plant.joint_pos[0] == pytest.approx(2.7, abs=2e-3)
+    assert host.world.plant.joint_pos[0] == pytest.approx(2.7, abs=4e-3)
 
 
 def test_power_cycle_loses_turns_and_unsaved_registers(tmp_path):
