@@ -9,6 +9,7 @@ to be written otherwise.
 from __future__ import annotations
 
 import ast
+import gc
 import importlib.machinery
 import os
 import signal
@@ -21,7 +22,7 @@ from types import CodeType
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 FORK = ("hypothesis.strategies", "numpy", "pytest", "sim2real.config")  # imported once, before the forks
-TESTS = ("test_gate.py", "test_safety_md.py", "test_boundaries.py", "test_sequences.py", "test_properties.py")
+TESTS = ("test_safety_md.py", "test_gate.py", "test_boundaries.py", "test_sequences.py", "test_properties.py")
 HANG = 120  # s; a mutant that takes longer has been noticed
 
 LT, LE, GT, GE, EQ, NE = ast.Lt, ast.LtE, ast.Gt, ast.GtE, ast.Eq, ast.NotEq
@@ -51,8 +52,10 @@ def replacements(node: object, field: str) -> Iterator[ast.AST]:
             yield ast.Name(NAMES[name], node.ctx)
         case ast.Attribute(attr=name) if name in NAMES:
             yield ast.Attribute(node.value, NAMES[name], node.ctx)
-        case ast.Return():
-            yield from (ast.Return(ast.Constant(None)), ast.Pass())
+        case ast.Return(value=value):
+            yield ast.Pass()
+            if not isinstance(value, ast.Constant | None):
+                yield ast.Return(ast.Constant(None))
         case (
             ast.Assign() | ast.AugAssign() | ast.AnnAssign(value=ast.expr()) | ast.Raise() | ast.Expr(value=ast.Call())
         ):
@@ -83,6 +86,7 @@ def born(module: str = "", code: CodeType | None = None) -> int:
         return pid
     import pytest
 
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
     signal.alarm(HANG)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     os.dup2(1, 2)
@@ -96,6 +100,7 @@ def main(wanted: str = "") -> int:
     begin = time.monotonic()
     for name in FORK:
         importlib.import_module(name)
+    gc.freeze()
     if os.waitpid(born(), 0)[1]:
         sys.exit("the tests of the gate fail on the gate itself: run pytest tests/sim2real/safety, then come back")
     files = sorted((ROOT / "sim2real/safety").glob("*.py"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -46,7 +46,6 @@ class Evidence:
 
     def see(self, state: RobotState, now: float) -> None:
         """Take in a state. One that is not of this moment makes every reading in it that much older."""
-        now = float(now)
         self.gap, self.now = now - self.now, now  # s since the tick before
         late = abs(now - state.time)
         _fill(
@@ -125,7 +124,8 @@ class Evidence:
         return self.now - self.holding_since
 
 
-def _fill(rows: Iterable[np.ndarray], arrays: Iterable[np.ndarray]) -> None:
-    for row, array in zip(rows, arrays, strict=True):
+def _fill(rows: Sequence[np.ndarray] | np.ndarray, arrays: tuple[np.ndarray, ...]) -> None:
+    for i, array in enumerate(arrays):
+        row = rows[i]
         fits = getattr(array, "shape", None) == row.shape and array.dtype.kind in "fiub"
         row[:] = array if fits else np.nan

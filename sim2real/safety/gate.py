@@ -46,8 +46,8 @@ class Safety:
         self._values = np.empty((len(RULES), len(limits.joint_names)))
         self._rows = list(self._values)
         self._limits = np.empty_like(self._values)
-        for row, rule in zip(self._limits, RULES, strict=True):
-            row[:] = rule.limit(limits)
+        for i, rule in enumerate(RULES):
+            self._limits[i] = rule.limit(limits)
         self._present: dict[int, Fault] = {}  # rule number -> what breaks it now
         t = self._limiter.targets
         self._command = JointCommand(math.nan, t[POSITION], t[VELOCITY], t[TORQUE], t[KP], t[KD])
@@ -57,19 +57,20 @@ class Safety:
 
         Commands that were decided before this are not obeyed: until one comes, kp is 0.
         """
-        if self.mode <= Mode.HOLD:
-            return None
-        evidence = self._evidence
-        with np.errstate(all="ignore"):
-            evidence.see(state, now)
-            broken = self._broken(RULES)
-        for fault in broken:
-            if self._forbids_arming(fault.rule):
-                return self.explain(fault, self.limits.joint_names)
-        self.mode, self.fault = Mode.RUN, None
-        evidence.armed_since, evidence.holding_since = evidence.now, math.inf
-        self._limiter.damp(evidence.joint_pos)
-        return None
+        refusal = None
+        if self.mode > Mode.HOLD:
+            evidence = self._evidence
+            with np.errstate(all="ignore"):
+                evidence.see(state, now)
+                broken = self._broken(RULES)
+            forbidding = [fault for fault in broken if self._forbids_arming(fault.rule)]
+            if forbidding:
+                refusal = self.explain(forbidding[0], self.limits.joint_names)
+            else:
+                self.mode, self.fault = Mode.RUN, None
+                evidence.armed_since, evidence.holding_since = evidence.now, math.inf
+                self._limiter.damp(evidence.joint_pos)
+        return refusal
 
     def stop(self, now: float) -> None:
         """The operator's stop: DAMP from the next step on. Never refused; OFF stays OFF."""

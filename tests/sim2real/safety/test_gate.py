@@ -130,6 +130,14 @@ def test_arm_refuses(bench, rule, changes):
     assert bench.arm() is None or rule == "arm_encoder"
 
 
+def test_an_old_state_is_old_in_all_its_parts(bench):
+    for off in (-1, 1):
+        for ages in ({}, {"joint_age": np.full(bench.n, -1.0), "imu_age": -1.0}):
+            bench.tick()
+            bench.tick(time=bench.time + DT + off, **ages)
+            assert {"joint_age", "imu_age"} <= set(bench.began())
+
+
 def test_wrong_quaternion_order_shows_on_a_robot_that_leans(bench):
     """(x, y, z, w) is the commonest mistake. Of an upright robot it makes another upright one; not of one that leans."""
     lean = 0.25
@@ -456,6 +464,13 @@ def test_never_heard_imu_is_no_crash(bench):
     assert {"imu_age", "imu_finite"} <= {f.rule.name for f in bench.safety._present.values()}
 
 
+@pytest.mark.parametrize(("first", "believed"), [(1000.0, True), (np.nextafter(-1000.0, -np.inf), False)])
+def test_a_first_reading_may_be_anywhere_within_reason(bench, first, believed):
+    evidence = Evidence(bench.limits)
+    evidence.see(bench.state(joint_pos={0: first}), bench.time)
+    assert evidence.joint_pos[0] == (first if believed else 0.0)
+
+
 # ---- time
 
 
@@ -575,6 +590,9 @@ def test_limits_refuse_numbers_that_contradict_each_other(robot):
         "lower damping or raise kd_max if the motor allows it"
     )
     dataclasses.replace(limits, damping=limits.kd_max)  # as strong as allowed
+    for field in ("target_min", "kd_max"):
+        with pytest.raises(ValueError, match="shorter"):
+            dataclasses.replace(limits, **{field: getattr(limits, field)[:-1]})
 
 
 def test_limits_are_the_robots_numbers(robot):

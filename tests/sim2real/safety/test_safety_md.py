@@ -22,7 +22,9 @@ def test_its_tables_are_the_rules(capsys):
     runpy.run_module("sim2real.safety", run_name="__main__")
     tables = capsys.readouterr().out
     assert tables.count("\n| S2R-") == len(RULES) + len(CLAMPS)
-    assert f"-->\n\n{tables}\n## " in TEXT, "SAFETY.md: the tables are old; put the output of `python -m sim2real.safety`"
+    assert f"-->\n\n{tables}\n## " in TEXT, (
+        "SAFETY.md: the tables are old; put the output of `python -m sim2real.safety`"
+    )
 
 
 def test_numbers_are_given_once_and_the_table_is_in_the_order_of_asking():
