@@ -116,8 +116,7 @@ def print_summary(console: Console, summary: Any) -> None:
     row("faults", ", ".join(summary.faults) or "none", "red" if summary.faults else "green")
     for refused in summary.refused_skills:
         row("refused", refused)
-    if summary.wire_sha256:
-        row("wire sha256", summary.wire_sha256)
-    if summary.record:
-        row("record", summary.record)
     console.print(table)
+    for name, value in (("wire sha256", summary.wire_sha256), ("record", summary.record)):
+        if value:  # never cut or wrapped: it is there to be copied
+            console.print(Text.assemble((f"{name:19}", "dim"), value), soft_wrap=True)
