@@ -98,6 +98,7 @@ class Simulation:
         self.every = round(player.period / period)
         self.schedule = Schedule(self.clock, period)
         self.since = -1.0  # s since the policy took over; negative before
+        self.elapsed = 0.0  # s of simulated time, from connecting to the end
         self.messages: list[str] = []
         self.measures = Measures(self.config, wiring, player)
 
@@ -143,6 +144,7 @@ class Simulation:
                 self.guardian.quit()
         self.clock.sleep_until(self.clock.now() + 0.01)  # the last frames are still on the wire
         summary = self.measures.summary(self.messages, self.player, wire_sha256=world.digest)
+        self.elapsed = self.clock.now() - began
         self.robot.close()
         self.operator.close()
         return summary

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import subprocess
 import sys
 from dataclasses import asdict, dataclass, field
@@ -56,6 +57,8 @@ class Args:
     """write the summary to this file"""
     video: Path | None = None
     """with lockstep: render the run to this .gif"""
+    visuals: Path | None = None
+    """with --video: an MJCF to show instead, such as the maker's with its meshes (joints matched by name)"""
     untuned: bool = False
     """do not ask the kernel for real-time scheduling"""
     hardware: bool = False
@@ -90,6 +93,8 @@ def _check(args: Args, config: RobotConfig) -> None:
         raise Sim2realError("--hardware with --clock lockstep: a real robot runs in real time; drop one of the two")
     if args.hardware and (args.fault or args.video):
         raise Sim2realError("--hardware with --fault or --video: those exist only in simulation; drop them")
+    if args.visuals and not args.video:
+        raise Sim2realError("--visuals without --video: nothing would be shown; add --video FILE.gif")
     if args.video and args.clock != "lockstep":
         raise Sim2realError("--video in real time: rendering would make the loop late; add --clock lockstep")
     if args.operator == "keyboard" and args.clock == "lockstep":
@@ -181,6 +186,18 @@ def _revision() -> str:
 
 
 def _lockstep(args, config, player, policies, paths, operator, record, console):
+    camera = None
+    if args.video:
+        if not os.environ.get("DISPLAY"):
+            os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo looks at this once, when it is first imported
+        try:
+            from drivers.sim.camera import Camera
+        except (ImportError, AttributeError, OSError) as error:
+            raise Sim2realError(
+                f"--video: MuJoCo finds no OpenGL: {error}; install libegl1 and libgl1-mesa-dri"
+            ) from None
+        camera = Camera(args.video, args.visuals)
+    from sim2real.clock import MonotonicClock
     from sim2real.recorder.process import Direct
     from sim2real.simulation import Scene, Simulation
 
@@ -191,11 +208,6 @@ def _lockstep(args, config, player, policies, paths, operator, record, console):
         sink = Direct(record, {"/tick": ticks, "/pilot": pilots}, *_about(args, config, policies, paths))
         return sink
 
-    camera = None
-    if args.video:
-        from drivers.sim.camera import Camera
-
-        camera = Camera(args.video)
     simulation = Simulation(
         config,
         policies,
@@ -206,9 +218,14 @@ def _lockstep(args, config, player, policies, paths, operator, record, console):
         (lambda run: camera.see(run.world.plant)) if camera else None,
         tell=lambda text: console.print(f"  {text}", style="yellow"),
     )
-    summary = simulation.run()
+    began = MonotonicClock.now()
+    try:
+        summary = simulation.run()
+    finally:
+        if sink is not None:
+            sink.close()
+    summary.real_time_factor = simulation.elapsed / (MonotonicClock.now() - began)
     if sink is not None:
-        sink.close()
         summary.record = str(record)
     if camera is not None:
         camera.save()
