@@ -30,7 +30,7 @@ h1 { font-size: 24px; margin: 0; } h2 { font-size: 16px; margin: 34px 0 4px; }
 p { margin: 0 0 10px; color: var(--soft); max-width: 80ch; } p.alarm { color: var(--red); font-weight: 600; }
 .card { background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 12px; overflow-x: auto; }
 .card > svg { min-width: 720px; }
-.tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(220px, 1fr)); gap: 10px; margin-top: 18px; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(250px, 1fr)); gap: 10px; margin-top: 18px; }
 .tile { background: var(--card); border: 1px solid var(--line); border-radius: 10px; padding: 10px 13px; }
 .tile b { display: block; font-size: 20px; font-weight: 600; overflow-wrap: anywhere; } .tile.alarm b { color: var(--red); }
 .tile span { color: var(--soft); font-size: 12px; overflow-wrap: anywhere; }
@@ -157,6 +157,7 @@ def _timeline(run: Run, summary: RecordSummary) -> str:
     for row, (name, periods) in enumerate((("mode", summary.modes), ("skill", summary.skills))):
         y = 2 + 30 * row
         out.append(f'<text class="tick end" x="44" y="{y + 17}">{name}</text>')
+        fault = ""
         for p in periods:
             x, end = frame.to_x(p.start), frame.to_x(p.end)
             css = p.name if name == "mode" and p.name in Mode.__members__ else "quiet"
@@ -169,10 +170,11 @@ def _timeline(run: Run, summary: RecordSummary) -> str:
                 f' width="{max(end - x - 1, 1):.1f}" height="26" rx="4"/>'
                 f'<text x="{x + 6:.1f}" y="{y + 17}">{text(label)}</text></g>'
             )
-            if p.fault:
+            if p.fault and p.fault != fault:
                 out.append(f'<path class="mark" d="M{x:.1f} {y}v64"/>')
                 side, gap = ("end", -5) if x > 700 else ("", 5)
                 out.append(f'<text class="{side}" x="{x + gap:.1f}" y="71">{text(p.fault)} {text(p.joint)}</text>')
+            fault = p.fault
     for t in ticks(*frame.x, 10):
         out.append(f'<text class="tick mid" x="{frame.to_x(t):.1f}" y="88">{t:g} s</text>')
     return frame.svg(*out, label="modes, skills and faults over time")

@@ -109,6 +109,7 @@ class Recorder:
         if first.get("event") != "ready":
             ours.close()
             self._process.kill()
+            self._process.wait()
             raise Sim2realError(first.get("text", f"{self.path}: the recorder did not start; see the messages above"))
         self.sink = Sink(ours, len(layouts))
 

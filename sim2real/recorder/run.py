@@ -12,6 +12,7 @@ import numpy as np
 
 from sim2real.config import ConfigError, RobotConfig, load_robot
 from sim2real.recorder.reader import Reader
+from sim2real.records import pilot_layout, tick_layout
 from sim2real.types import Sim2realError
 
 TICK, PILOT = "/tick", "/pilot"
@@ -42,12 +43,26 @@ class Run:
         self.tick: np.ndarray = self.reader[TICK]
         if len(self.tick) == 0:
             raise Sim2realError(f"{self.path}: a record with no tick in it: the run ended before it began")
+        for topic, expected in (
+            (TICK, tick_layout(("x",), ("x",))),
+            (PILOT, pilot_layout(("x",), {}, ("x",))),
+        ):
+            if topic in self.reader.topics:
+                self._same_version(topic, set(expected.dtype.names or ()))
         self.pilot: np.ndarray = self.reader[PILOT] if PILOT in self.reader.topics else np.zeros(0)
         elements = self.reader.layouts[TICK].elements
         self.joints = elements["state.joint_pos"]
         self.buses = elements["bus.load"]
         self.labels = self.reader.layouts[PILOT].elements.get("skill_value", ()) if PILOT in self.reader.topics else ()
         self.start = float(self.tick["time"][0])
+
+    def _same_version(self, topic: str, expected: set[str]) -> None:
+        if absent := sorted(expected - set(self.reader[topic].dtype.names or ())):
+            names = ", ".join(f"'{name}'" for name in absent)
+            raise Sim2realError(
+                f"{self.path}: recorded by another version of sim2real: its {topic.strip('/')}s have no {names};"
+                f" look into it with the version that wrote it ({self.metadata.get('revision') or 'not stated'})"
+            )
 
     @property
     def metadata(self) -> dict[str, str]:

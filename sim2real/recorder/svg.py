@@ -135,7 +135,7 @@ def strip_image(values: np.ndarray, time: np.ndarray, columns: int = 600) -> str
 
 def strips(values: np.ndarray, time: np.ndarray, names: Sequence[str], notes: Sequence[str], label: str) -> str:
     """A row per name: the name, its values over time as colour, and a note."""
-    row, left, right, width = 15, 190, 90, 1000
+    row, left, right, width = 15, 190, 60, 1000
     frame = Frame((float(time[0]), float(time[-1])), (0, 1), width - right, row * len(names) + 20, left)
     image = (
         f'<image x="{left}" y="0" width="{width - left - right - 6}" height="{row * len(names)}"'
@@ -156,7 +156,7 @@ def strips(values: np.ndarray, time: np.ndarray, names: Sequence[str], notes: Se
 
 
 def histogram(values: np.ndarray, edges: np.ndarray, label: str) -> str:
-    """Bars of how many ``values`` (s) lie between the ``edges``, on a logarithmic scale of counts."""
+    """Bars of how many ``values`` (s) lie between the ``edges``, what is beyond them in the outermost; logarithmic."""
     counts, _ = np.histogram(np.clip(values[np.isfinite(values)], edges[0], edges[-1]), edges)
     height = np.log10(np.maximum(counts, 0.5) / 0.5)
     frame = Frame((0, len(counts)), (0, max(1.0, float(height.max()) * 1.1)), 490, 170, 14, 22)
@@ -173,7 +173,7 @@ def histogram(values: np.ndarray, edges: np.ndarray, label: str) -> str:
             )
     names = "".join(
         f'<text class="tick mid" x="{frame.to_x(i):.1f}" y="{frame.height - 6}">{_duration(edge)}</text>'
-        for i, edge in enumerate(edges)
+        for i, edge in enumerate(edges[:-1])
     )
     base = f'<path class="axis" d="M{frame.left} {frame.to_y(0):.1f}H{frame.width - 6}"/>'
     return frame.svg(*bars, base, names, label=label)

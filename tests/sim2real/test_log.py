@@ -26,6 +26,7 @@ from sim2real.recorder.replay import replay
 from sim2real.recorder.run import Run, spans
 from sim2real.recorder.summary import summarise
 from sim2real.recorder.svg import bounds, path, text, thin, ticks
+from sim2real.records import Calls, layout
 from sim2real.simulation import Scene, Simulation
 from sim2real.skills import SkillPlayer
 from sim2real.types import Mode, Sim2realError
@@ -346,7 +347,10 @@ def test_every_input_of_the_gate_matters(record, tmp_path):
     def silent(tick, pilot):
         tick["request.time"][:] = 0.0
 
-    for change in (not_armed, hot, silent):
+    def stopped_by_a_bus(tick, pilot):
+        tick["calls"][200] = Calls.STOP_AFTER
+
+    for change in (not_armed, hot, silent, stopped_by_a_bus):
         assert "mode" in replay(Run(altered(record, tmp_path, change))).changed
         (tmp_path / "altered.mcap").unlink()
 
@@ -371,6 +375,63 @@ def test_another_policy_changes_targets(record, tiny, tmp_path, capsys):
     document["default_skill"] = "sit"
     code, _, err = log(capsys, "replay", record, "--policy", tiny_policy.write(tmp_path / "sit.onnx", graph, document))
     assert code == 2 and "skill_labels: got ('sit',), expected ('stand',)" in err
+
+
+def sealed(path: Path, name: str, skill: str, default: float) -> Path:
+    """A tiny policy of another name and skill, around another posture, that also says what it expects."""
+    robot = load_robot("g1")
+    text = tiny_policy.TEXT.replace("carry_count_next) {{", "carry_count_next, float[1,1] skill_value) {{").replace(
+        "moved = Add", "skill_value = Mul (carry_count, rate)\n    moved = Add"
+    )
+    graph, document = tiny_policy.model(robot, text), tiny_policy.document(robot)
+    for tensor in graph.graph.initializer:
+        if tensor.name == "default":
+            posture = robot.home_pos[None].astype("f4") + np.float32(default)
+            tensor.CopyFrom(tiny_policy.onnx.numpy_helper.from_array(posture, "default"))
+    for golden in document["golden"]:
+        golden["outputs"]["joint_pos_target"] = (np.array(golden["outputs"]["joint_pos_target"]) + default).tolist()
+    document |= {"name": name, "skills": [{"label": skill}], "default_skill": skill}
+    document["outputs"]["skill_value"] = [1]
+    return tiny_policy.write(path, graph, document)
+
+
+@pytest.mark.slow
+def test_two_policies_replay_through_their_blends(tmp_path):
+    """Switches there and back: each policy starts over, targets blend, and values are compared, too."""
+    robot = load_robot("g1")
+    files = [sealed(tmp_path / "a.onnx", "a", "stand", 0.0), sealed(tmp_path / "b.onnx", "b.c", "lean", 0.02)]
+    policies = [load_policy(path) for path in files]
+    path = tmp_path / "two.mcap"
+    sinks = []
+
+    def sink_for(tick, pilot) -> Direct:
+        attachments = {"robot.yaml": robot.path.read_bytes(), **{f.name: f.read_bytes() for f in files}}
+        sinks.append(Direct(path, {"/tick": tick, "/pilot": pilot}, {}, attachments))
+        return sinks[0]
+
+    steps = [Step("stand", 0.4), Step("lean", 0.4), Step("stand", 0.2)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(SkillPlayer, "gain_time", 0.1)
+        patch.setattr(SkillPlayer, "move_time", 0.3)
+        patch.setattr(Guardian, "damp_time", 0.1)
+        Simulation(robot, policies, ScriptOperator(steps), Scene(seed=3), sink_for=sink_for).run()
+    sinks[0].close()
+    run = Run(path)
+    performed = [s.value[1] for s in run.skills() if s.value[0] == 2]
+    assert performed == [0, 1, 0]
+    assert summarise(run).refused_switches == run.pilot["refused"][-1]
+    assert replay(run, tolerance=0.0, policy_tolerance=0.0).identical
+
+    def value(tick, pilot):
+        pilot["skill_value"][np.flatnonzero(pilot["skill"] == 1)[5], 1] += 0.5
+
+    def blended(tick, pilot):
+        pilot["command.joint_pos"][np.flatnonzero(pilot["skill"] == 1)[5], 0] += 0.01
+
+    for change, what, where in ((value, "skill_value", "lean"), (blended, "joint_pos_target", run.joints[0])):
+        (found,) = replay(Run(altered(path, tmp_path, change))).first
+        assert (found.what, found.where) == (what, where)
+        (tmp_path / "altered.mcap").unlink()
 
 
 def test_lost_ticks_are_said(record, tmp_path):
@@ -438,6 +499,14 @@ def test_a_record_without_ticks(tmp_path, capsys):
     path = write_record(tmp_path / "p.mcap", {"/pilot": random_walk(LAYOUTS["/pilot"], 9)}, only_pilot)
     code, _, err = log(capsys, "summary", path)
     assert code == 2 and "without a guardian's ticks; it has /pilot" in err
+
+
+def test_a_record_of_another_version(tmp_path, capsys):
+    fields = [(n, "f8", None) for n in ("time", "tick", "mode")]
+    old = layout("Tick", [*fields, ("state.joint_pos", "f8", ("a",)), ("bus.load", "f8", ("b",))])
+    path = write_record(tmp_path / "old.mcap", {"/tick": random_walk(old, 9)}, {"/tick": old})
+    code, _, err = log(capsys, "summary", path)
+    assert code == 2 and "recorded by another version of sim2real: its ticks have no 'bus.lost', 'bus.received'" in err
 
 
 def test_plot_says_where(record, tmp_path, capsys):

@@ -93,6 +93,36 @@ def test_the_index_is_sound(record):
         assert [a.name for a in reader.iter_attachments()] == list(ATTACHMENTS)
 
 
+@pytest.mark.parametrize("compression", ["NONE", "LZ4", "ZSTD"])
+@pytest.mark.parametrize("chunked", [True, False])
+def test_a_record_rewritten_by_another_tool(record, tmp_path, compression, chunked):
+    """Other compression, other channel numbers, one topic after the other, no chunks: the same record."""
+    from mcap.reader import SeekingReader
+    from mcap.writer import CompressionType
+    from mcap.writer import Writer as McapWriter
+
+    path = tmp_path / "rewritten.mcap"
+    with record.open("rb") as file, path.open("wb") as copy:
+        source, writer = (
+            SeekingReader(file),
+            McapWriter(copy, 100_000, CompressionType[compression], use_chunking=chunked),
+        )
+        writer.start()
+        for metadata in source.iter_metadata():
+            writer.add_metadata(metadata.name, metadata.metadata)
+        for a in source.iter_attachments():
+            writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
+        writer.register_channel("/unrelated", "json", 0)
+        for topic in ("/pilot", "/tick"):
+            channel = writer.register_channel(topic, "cdr", 0)
+            for _, _, m in source.iter_messages(topics=topic):
+                writer.add_message(channel, m.log_time, m.data, m.publish_time)
+        writer.finish()
+    reader = Reader(path)
+    assert all(reader[topic].tobytes() == array.tobytes() for topic, array in ARRAYS.items())
+    assert reader.attachments == ATTACHMENTS
+
+
 def test_names_become_ros_identifiers():
     hostile = ["Left Knee", "left_knee", "left-knee", "7", "", "__x__", "é", "a\n# b", "x" * 5]
     names = identifiers(hostile)
