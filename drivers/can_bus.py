@@ -39,7 +39,7 @@ class RegisterAnswer(NamedTuple):
 
     row: int  # which motor of the bus
     register: str
-    value: float | int
+    value: float | int  # NaN: the motor has no such register
     written: bool  # the answer to a write, not to a read
 
 
@@ -63,6 +63,8 @@ class CanCodec(Protocol):
 
     def unpack(self, frames: np.ndarray, state: MotorState, now: float) -> int: ...
 
+    def owners(self, frames: np.ndarray) -> np.ndarray: ...
+
     def error_name(self, code: int) -> str: ...
 
 
@@ -76,7 +78,7 @@ class CanBus:
         self._wire = wire
         self._clock: Clock | None = None
         self._state = MotorState.empty(len(spec.motors))
-        self._heard: set[int] = set()  # identifiers of the frames that arrived while connecting
+        self._strangers: set[int] = set()  # identifiers of frames from nobody on this bus, while connecting
         self._whole = 0.0  # s, when a tick last went out whole
 
     def connect(self, clock: Clock) -> None:
@@ -87,7 +89,7 @@ class CanBus:
         """
         self._clock = clock
         self._whole = clock.now()
-        self._heard.clear()
+        self._strangers.clear()
         self._receive()  # what others left there
         self._transmit(self._codec.pack_disable(), required=True)
         for check in self._codec.checks:
@@ -158,35 +160,44 @@ class CanBus:
 
     def _check(self, check: RegisterCheck, clock: Clock) -> None:
         """Write (if it is to be written) and read back one register of every motor, and compare."""
-        for value in [check.expected, None] if check.write else [None]:
-            got = self._ask(check.register, value, clock)
+        expected = check.expected.tolist()
+        got = self._ask(check, expected, clock)
         wrong = [
             f"bus {self.spec.name}, motor of {m.joint} (id {m.id:#x}, {m.model}): register {check.register} is "
-            f"{got[row]:g}, expected {expected:g}"
-            for row, (m, expected) in enumerate(zip(self.spec.motors, check.expected.tolist(), strict=True))
-            if not abs(got[row] - expected) <= REGISTER_TOLERANCE * abs(expected)
+            f"{got[row]:g}, expected {expected[row]:g}"
+            for row, m in enumerate(self.spec.motors)
+            if not _agree(got[row], expected[row])
         ]
         if wrong:
             raise BusError("\n".join(wrong) + f"\n  {check.consequence}")
 
-    def _ask(self, register: str, value: np.ndarray | None, clock: Clock) -> dict[int, float | int]:
-        """The answers {row: value} of all motors to reading ``register``, or to writing ``value`` (n,) to it."""
+    def _ask(self, check: RegisterCheck, expected: list[float], clock: Clock) -> dict[int, float | int]:
+        """What every motor's register holds, {row: value}. What is to be written goes ahead of each question, until it
+        has arrived: not every protocol confirms a write, and any frame may get lost."""
         answers: dict[int, float | int] = {}
         motors = range(len(self.spec.motors))
 
+        def settled(row: int) -> bool:
+            return row in answers and (not check.write or _agree(answers[row], expected[row]))
+
         def request() -> np.ndarray:
-            missing = [row for row in motors if row not in answers]
-            asked = [self._codec.pack_register(row, register, None if value is None else value[row]) for row in missing]
-            return np.concatenate(asked)
+            frames = []
+            for row in motors:
+                if not settled(row):
+                    if check.write:
+                        frames.append(self._codec.pack_register(row, check.register, expected[row]))
+                    frames.append(self._codec.pack_register(row, check.register))
+            return np.concatenate(frames)
 
         def take(frames: np.ndarray) -> bool:
             for answer in self._codec.unpack_registers(frames):
-                if answer.register == register and answer.written == (value is not None):
+                if answer.register == check.register and not answer.written:
                     answers[answer.row] = answer.value
-            return len(answers) == len(motors)
+            return all(map(settled, motors))
 
-        if not self._converse(request, take, clock):
-            self._refuse_silence([row for row in motors if row not in answers], f"a request for register {register}")
+        self._converse(request, take, clock)
+        if silent := [row for row in motors if row not in answers]:
+            self._refuse_silence(silent, f"a request for register {check.register}")
         return answers
 
     def _hear_all(self, clock: Clock) -> None:
@@ -215,17 +226,17 @@ class CanBus:
                 clock.sleep_until(clock.now() + POLL_PERIOD)
                 frames = self._receive()
                 self.counters.received += len(frames)
-                self._heard.update(frames["id"].tolist())
+                self._strangers.update(frames["id"][self._codec.owners(frames) < 0].tolist())
                 if take(frames):
                     return True
         return False
 
     def _refuse_silence(self, rows: list[int], question: str) -> NoReturn:
         """Raise BusError for motors that did not answer."""
-        strangers = self._heard - {m.feedback_id for m in self.spec.motors}
-        heard = ", ".join(f"{i:#x}" for i in sorted(strangers)) or "none"
+        heard = ", ".join(f"{i:#x}" for i in sorted(self._strangers)) or "none"
         lines = [
-            f"bus {self.spec.name}, motor of {m.joint} (id {m.id:#x}): no answer on {m.feedback_id:#x} to {question}, "
+            f"bus {self.spec.name}, motor of {m.joint} (id {m.id:#x}): no answer"
+            f"{f' on {m.feedback_id:#x}' if m.feedback_id else ''} to {question}, "
             f"tried {TRIES} times for {ANSWER_TIME * 1e3:g} ms"
             for m in (self.spec.motors[row] for row in rows)
         ]
@@ -234,3 +245,8 @@ class CanBus:
 
     def _where(self) -> str:
         return f"{self.spec.interface} {self.spec.channel}".strip()
+
+
+def _agree(got: float, expected: float) -> bool:
+    """NaN agrees with nothing."""
+    return abs(got - expected) <= REGISTER_TOLERANCE * abs(expected)

@@ -273,6 +273,10 @@ class DamiaoCodec:
         state.time[rows] = now
         return strangers
 
+    def owners(self, frames: np.ndarray) -> np.ndarray:
+        """Whose each of ``frames`` is, by its identifier: (m,) rows of the motors, -1 for nobody on this bus."""
+        return self._row_of[np.minimum(frames["id"], 0x800)]
+
     def _is_one_each(self, frames: np.ndarray) -> bool:
         """Whether ``frames`` are feedback of every motor in turn, as in nearly every tick: what _sort finds, cheaper."""
         if len(frames) != len(self._ids):
@@ -289,7 +293,7 @@ class DamiaoCodec:
         is a position within a thousandth of the negative end and a velocity below -36 % of full scale.
         """
         data = frames["data"]
-        rows = self._row_of[np.minimum(frames["id"], 0x800)]
+        rows = self.owners(frames)
         ids = self._ids[rows]
         answers = (
             (data[:, 1] == ids >> 8) & (data[:, 0] == ids & 0xFF) & IS_ANSWER[data[:, 2]] & IS_REGISTER[data[:, 3]]

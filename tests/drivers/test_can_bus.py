@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from dataclasses import replace
 
 import numpy as np
@@ -152,15 +153,16 @@ def test_a_motor_that_answers_elsewhere_is_hinted_at():
 
 def test_lost_frames_are_asked_again_and_a_connection_stays_below_a_second():
     bus, wire, clock = made(connect=False)
-    turn = {"n": 0}
+    lost, draw = [], random.Random(1)
 
     def lose(row: int, kind: int) -> bool:
-        turn["n"] += 1
-        return turn["n"] % 2 == 0
+        lost.append(draw.random() < 0.4)
+        return lost[-1]
 
     wire.lose = lose
     bus.connect(clock)
     assert clock.now() - 100 < 1.0
+    assert sum(lost) > 10
 
 
 def test_a_motor_that_stays_enabled_is_refused():
@@ -180,21 +182,20 @@ def test_what_waited_on_the_wire_is_no_answer():
 
 def test_a_late_echo_of_a_write_does_not_pass_for_reading_back():
     bus, wire, clock = made(connect=False)
-    asked = {"TIMEOUT": 0}
+    asked: list[int] = []  # operations on TIMEOUT of joint_1
 
     def lose(row: int, kind: int) -> bool:
-        """Every request to read TIMEOUT of joint_1 is lost, and the echo of the write arrives instead."""
-        request = damiao.unpack_register(wire.sent[-1]["data"][row]) if kind == Kind.REGISTER else None
-        if row or request is None or request[1:3] != (Operation.READ, "TIMEOUT"):
+        """Every request to read TIMEOUT of joint_1 is lost, and the echo of the write before it arrives."""
+        requests = [damiao.unpack_register(data) for data in wire.sent[-1]["data"]]
+        if row or kind != Kind.REGISTER or requests[0].register != "TIMEOUT":
             return False
-        wire.arrive(wire.codec.pack_register(0, Operation.WRITE, "TIMEOUT", 1600))
-        asked["TIMEOUT"] += 1
-        return True
+        asked.append(requests[len(asked) % 2].operation)
+        return asked[-1] == Operation.READ
 
     wire.lose = lose
     with pytest.raises(BusError, match="joint_1 .*no answer on 0x11 to a request for register TIMEOUT"):
         bus.connect(clock)
-    assert asked["TIMEOUT"] == TRIES
+    assert asked == [Operation.WRITE, Operation.READ] * TRIES
 
 
 def test_connecting_again_does_not_take_an_old_state_for_an_answer():
