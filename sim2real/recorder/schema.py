@@ -9,8 +9,6 @@ import json
 import re
 from collections.abc import Iterable
 
-import numpy as np
-
 from sim2real.records import Layout, layout
 from sim2real.types import Sim2realError
 
@@ -95,8 +93,3 @@ def layout_from_json(text: str) -> Layout:
         return layout(str(document["name"]), fields)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"not a record layout: {error}") from None
-
-
-def empty(record: Layout) -> np.ndarray:
-    """No record of this layout, shape (0,)."""
-    return np.zeros(0, record.dtype)
