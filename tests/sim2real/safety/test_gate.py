@@ -405,6 +405,14 @@ def test_damping_follows_the_joint_and_survives_nan(bench):
     assert (command.joint_pos == bench.pose).all()
 
 
+def test_only_what_is_limited_now_is_counted(bench):
+    bench.armed().tick(command={"kp": {0: 1e6}})
+    assert bench.safety.limited == 1
+    bench.safety.stop(bench.time)
+    bench.tick(command={"kp": {0: 1e6}})
+    assert bench.safety.limited == 0
+
+
 def test_damping_outside_the_soft_range_stays_inside_it(bench):
     bench.armed().safety.stop(bench.time)
     bench.pose = bench.robot.position_max + 1.0
