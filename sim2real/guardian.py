@@ -60,7 +60,9 @@ class Guardian:
     ``tell`` receives a sentence for the operator whenever something was refused or went wrong.
     """
 
-    response_share = 0.35  # of a tick, between sensing and acting: the pilot's answer goes out in the tick it belongs to,
+    response_share = (
+        0.35  # of a tick, between sensing and acting: the pilot's answer goes out in the tick it belongs to,
+    )
     # and the motors' replies are still back before the next
     enable_time = 0.3  # s for every motor to answer that it is enabled
     damp_time = 1.5  # s of damping at the end of a run before the motors are switched off
@@ -91,6 +93,8 @@ class Guardian:
         self._arm_seen = False
         self._ending: float | None = None
         self._told_fault: object = None
+        self._told_error = ""
+        self._failed = Calls(0)  # stops that a failing bus caused in this tick
         budgets = [budget(bus.spec, 1.0 / period) for bus in robot.buses]
         self._load = np.array([b.load / b.frames for b in budgets])  # of the wire, a frame per tick
         self._frames = np.zeros(len(robot.buses))
@@ -105,7 +109,8 @@ class Guardian:
     def sense(self, scheduled: float, lateness: float = 0.0, late: int = 0) -> None:
         """Take in what the robot said and publish it. Never raises for anything that a bus does."""
         r, start = self.record, self.clock.now()
-        self._guard(lambda: self.robot.read(start, self._state))
+        self._failed = Calls(0)
+        self._guard(lambda: self.robot.read(start, self._state), Calls.STOP)
         r["time"], r["tick"], r["late"], r["timing.lateness"] = scheduled, self._tick, late, lateness
         r["state.time"], r["state.imu_age"] = self._state.time, self._state.imu_age
         r["timing.read"] = self.clock.now() - start
@@ -116,12 +121,12 @@ class Guardian:
         or an operator does."""
         clock = self.clock
         start = clock.now()
-        calls = self._obey_operator(start)
+        calls = self._obey_operator(start) | self._failed
         command = self.safety.step(self._state, self._request(), start)
         judged = clock.now()
         self._transmit(command)
         self._report_fault()
-        self._store(command, calls, (start, judged, clock.now()))
+        self._store(command, calls | self._failed, (start, judged, clock.now()))
         self._tick += 1
 
     def stop_at_once(self) -> None:
@@ -172,7 +177,7 @@ class Guardian:
                 self._enabling = None
                 self.robot.disable()
             else:
-                self._guard(self.robot.enable)
+                self._guard(self.robot.enable, Calls.STOP)
             return False
         self._enabling = None
         if refusal := self.safety.arm(state, now):
@@ -183,18 +188,21 @@ class Guardian:
 
     def _transmit(self, command: JointCommand) -> None:
         if self.safety.mode != Mode.OFF or self._enabling is not None:
-            self._guard(lambda: self.robot.write(command))
+            self._guard(lambda: self.robot.write(command), Calls.STOP_AFTER)
         elif self.record["mode"][0] != Mode.OFF or self._tick == 0:
             self.robot.disable()
         else:
-            self._guard(self.robot.poll)
+            self._guard(self.robot.poll, Calls.STOP_AFTER)
 
-    def _guard(self, act: Callable[[], None]) -> None:
-        """Do something on the wire. A bus that fails is damped with the rest: its motors' ages tell the gate."""
+    def _guard(self, act: Callable[[], None], call: Calls) -> None:
+        """Do something on the wire. If it fails the gate is stopped, and ``call`` says so in the record."""
         try:
             act()
         except Exception as error:  # noqa: BLE001 - the loop must not unwind while motors hold torque
-            self.tell(str(error))
+            if str(error) != self._told_error:
+                self.tell(str(error))
+            self._told_error = str(error)
+            self._failed |= call
             self.safety.stop(self._state.time)
 
     def _report_fault(self) -> None:
@@ -216,7 +224,9 @@ class Guardian:
         _copy(command, self._sent)
         r["command.time"] = command.time
         r["timing.safety"], r["timing.write"] = judged - start, written - judged
-        counted = [(b.counters.sent, b.counters.received, b.counters.rejected, b.counters.lost) for b in self.robot.buses]
+        counted = [
+            (b.counters.sent, b.counters.received, b.counters.rejected, b.counters.lost) for b in self.robot.buses
+        ]
         r["bus.sent"][0], r["bus.received"][0], r["bus.rejected"][0], r["bus.lost"][0] = zip(*counted, strict=True)
         frames = (r["bus.sent"] + r["bus.received"])[0]
         if self._tick:  # smoothed over a tenth of a second; without what connecting took

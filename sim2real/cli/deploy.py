@@ -31,7 +31,7 @@ class Args:
     """a robot of configs/robots, or the path of a YAML"""
     wiring: str = ""
     """which of the robot's wirings; default: its default"""
-    policy: list[Path] = field(default_factory=list)
+    policy: tyro.conf.UseAppendAction[list[Path]] = field(default_factory=list)
     """policy files; default: those the robot's YAML names"""
     skill: str = ""
     """perform only this skill"""
@@ -47,8 +47,8 @@ class Args:
     """lockstep: faster than real time and deterministic, simulation only"""
     seed: int = 0
     """of everything random in the simulation"""
-    fault: list[str] = field(default_factory=list)
-    """faults of the simulated wire, as in drop:0.1 or off:left_leg/left_knee_joint@5"""
+    fault: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """faults of the simulated wire, as in drop:0.1 or off:left_leg/left_knee_joint@8 (s; arming is at about 3)"""
     record: Path = Path("runs")
     """where records go: a directory, or an .mcap file"""
     no_record: bool = False
@@ -66,7 +66,9 @@ class Args:
 
 
 def main(argv: list[str]) -> int:
-    args = tyro.cli(Args, args=argv, prog="sim2real deploy", description=__doc__)
+    args = tyro.cli(
+        Args, args=argv, prog="sim2real deploy", description=__doc__, config=(tyro.conf.FlagCreatePairsOff,)
+    )
     console = Console()
     config = load_robot(args.robot)
     _check(args, config)
@@ -172,8 +174,8 @@ def _about(args: Args, config: RobotConfig, policies, paths) -> tuple[dict[str, 
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
     }
     attachments = {"robot.yaml": config.path.read_bytes(), "run.json": json.dumps(metadata).encode()}
-    for path in paths:
-        attachments[Path(path).name] = Path(path).read_bytes()
+    for i, path in enumerate(paths):
+        attachments[f"{i}-{Path(path).name}"] = Path(path).read_bytes()
     return metadata, attachments
 
 
