@@ -12,15 +12,19 @@ from drivers.wire import WireError
 
 
 class BusProtocol(NamedTuple):
-    """A motor protocol: the kind of wire that it runs on, its bus class and its codec ("module:Class")."""
+    """A motor protocol: the kind of wire that it runs on, its bus class, its codec and its emulated motors
+    ("module:Class")."""
 
     wire: str
     bus: str
     codec: str
+    motors: str = ""
 
 
 PROTOCOLS: dict[str, BusProtocol] = {
-    "damiao": BusProtocol("can", "drivers.can_bus:CanBus", "drivers.codecs.damiao:DamiaoCodec"),
+    "damiao": BusProtocol(
+        "can", "drivers.can_bus:CanBus", "drivers.codecs.damiao:DamiaoCodec", "drivers.sim.damiao:SimDamiao"
+    ),
 }
 
 IMUS: dict[str, str] = {

@@ -1,17 +1,16 @@
-"""Emulated Damiao motors: what is behind the connector, decoded with the same codec as the host's side.
+"""Emulated motors: what is behind the connector, decoded with the same codec as the host's side.
 
-All motors of all buses are rows of the same arrays, so that a tick costs one decode and one encode. Each is a state
-machine with enable state, error, registers, watchdog and temperature; its PD law runs inside the plant's integrator in
-every substep, from the moment its command arrived on (within a substep the law is the time-weighted mean of old and
-new, which gives the exact impulse).
+All motors of one protocol, on all its buses, are rows of the same arrays, so that a tick costs one decode and one encode.
+Each is a state machine with enable state, error, registers, watchdog and temperature; its PD law runs inside the plant's
+integrator in every substep, from the moment its command arrived on (within a substep the law is the time-weighted mean
+of old and new, which gives the exact impulse). A frame is answered with the motor's state of the current substep and
+only then obeyed (reply before apply).
 
-A frame is answered with the motor's state of the current substep and only then obeyed (reply before apply).
-On expiry of TIMEOUT the motor disables itself with error D and stays so until clear and enable; it does not damp.
-What counts as life for the watchdog is not documented: here commands and enable frames, not questions.
+SimMotors is what all protocols share. A protocol is one class derived from it, in a file of its own, named in
+``drivers/open.py``; what it does on the wire, and what its devices do when their watchdog expires, is said there.
 
-Not modelled: current loop and its bandwidth, cogging, torque that falls with speed or voltage, over-voltage,
-under-voltage and over-current errors, control modes other than MIT (their frames are ignored, as by a motor in MIT
-mode), re-addressing by writing MST_ID or ESC_ID (remembered, without effect), answers while zeroing.
+Not modelled by any: current loop and its bandwidth, cogging, torque that falls with speed or voltage, over-voltage,
+under-voltage and over-current errors, answers while zeroing.
 """
 
 from __future__ import annotations
@@ -22,29 +21,24 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from drivers.bus import BusError, BusSpec
-from drivers.codecs import damiao
-from drivers.codecs.damiao import Kind, Operation
-from drivers.codecs.mit import Ranges
-from drivers.sim.wire import priority
-from drivers.wire import FRAME, make_frames
-
-PROTOCOL = "damiao"
-MAGIC_PREFIX = b"\xff" * 7
+from drivers.bus import BusError, BusSpec, MotorCommand
+from drivers.wire import FRAME
 
 # A plain two-node thermal model; its constants are of the right size for a motor of this class, not measured.
 AMBIENT = 25.0  # deg C
-ROTOR_RISE = 60.0  # K above ambient that the rotor settles at under a third of TMAX
+ROTOR_RISE = 60.0  # K above ambient that the rotor settles at under a third of its torque
 ROTOR_TIME = 120.0  # s
 DRIVER_RISE = 30.0  # K
 DRIVER_TIME = 20.0  # s
-RATED_SHARE = 1 / 3  # of TMAX
-DRIVER_LIMIT = 120.0  # deg C: error B
-ROTOR_LIMIT = 100.0  # deg C: OT_VALUE, error C
+RATED_SHARE = 1 / 3  # of full torque
+DRIVER_LIMIT = 120.0  # deg C
+ROTOR_LIMIT = 100.0  # deg C
 THERMAL_PERIOD = 0.02  # s
 
 OFF, LIMP, DAMPING, DRIVING = range(4)
 EFFECTS = ("disabled", "limp", "damping", "driving")
+
+Answer = tuple[int, int, bytes, int]  # row, arbitration key, raw frame, bits on the wire
 
 
 class MotorEvent(NamedTuple):
@@ -77,8 +71,11 @@ class Body(Protocol):
 class SimMotors:
     """The motors of ``buses``, in their order, on the joints of ``body`` (which has the same order).
 
-    ``registers``: by joint, registers that differ from the factory's. ``wrap``: a position beyond PMAX comes back in
+    ``registers``: by joint, registers that differ from the factory's. ``wrap``: a position out of range comes back in
     from the other end instead of saturating. ``frame_bits``: length of frames on the wire (drivers.budget).
+
+    A protocol says what its ``factory`` registers are, and how to ``receive`` frames, to ``_pack_feedback``, to make
+    ``_targets`` of what it was told (``_obey``), to ``_configure`` itself by its registers and to ``_trip``.
     """
 
     def __init__(
@@ -90,25 +87,19 @@ class SimMotors:
         registers: Mapping[str, Mapping[str, float]] | None = None,
         wrap: bool = False,
     ):
-        for spec in buses:
-            if spec.protocol != PROTOCOL:
-                raise BusError(f"bus {spec.name}: no emulated motors for '{spec.protocol}', expected {PROTOCOL}")
         self.specs = tuple(m for b in buses for m in b.motors)
         self.joints = [m.joint for m in self.specs]
         self.bus_names = [b.name for b in buses for _ in b.motors]
         n = len(self.specs)
         self._body, self._frame_bits, self._wrap = body, frame_bits, wrap
-        self._decoders = [damiao.DamiaoMotors(b) for b in buses]  # one for each bus: whom a frame is for
         self._bus_of = np.repeat(np.arange(len(buses)), [len(b.motors) for b in buses])
         self._first = [int(np.flatnonzero(self._bus_of == i)[0]) for i in range(len(buses))]
         self._all = replace(buses[0], name="all", motors=self.specs)
         self._rows = [{m.id: self._first[i] + k for k, m in enumerate(b.motors)} for i, b in enumerate(buses)]
         self._sign = np.array([m.sign for m in self.specs], float)
         self._offset = np.array([m.offset for m in self.specs])
-        self._keys = [priority(m.feedback_id) for m in self.specs]
 
-        factory = damiao.ranges_of(self.specs)
-        self._flash = [_factory_registers(m, factory, i) for i, m in enumerate(self.specs)]
+        self._flash = self.factory()
         for joint, changes in (registers or {}).items():
             if joint not in self.joints:
                 raise BusError(f"registers: got joint '{joint}', expected one of {', '.join(self.joints)}")
@@ -122,8 +113,12 @@ class SimMotors:
         self.driver_temperature = np.full(n, AMBIENT)
         self.zero = np.zeros(n)  # rad that the motor takes off its shaft angle
         self.powered = [True] * n
+        self._fed = np.full(n, -np.inf)  # s, when the watchdog last heard what it counts as life
+        self._timeout = np.full(n, np.inf)  # s, of the watchdog
+        self._rated = np.ones(n)  # N m
+        self._rotor_limit = np.full(n, ROTOR_LIMIT)
         self._effect = np.zeros(n, np.int64)
-        self._data = np.zeros((n, 8), np.uint8)  # the last command of each
+        self._last = np.zeros(n, FRAME)  # the last command of each
         self._commanded = np.zeros(n, bool)  # since it was enabled
         self._law = np.zeros((3, n))  # bias, kp, kd at the joints
         self._changed = False  # the law is no longer what commands and states make of it
@@ -135,77 +130,52 @@ class SimMotors:
         self._stale = True
         self._feedback = b""
         self._bits: list[int] = []
+        self._keys: list[int] = []
         self._registers = [dict(r) for r in self._flash]
         self._configure()
 
+    # -- what a protocol adds ----------------------------------------------------------------------------------------
+
+    def factory(self) -> list[dict[str, float]]:
+        """What the registers of each motor hold when it leaves the factory."""
+        raise NotImplementedError
+
+    def receive(self, bus: int, id: int, raw: bytes, time: float) -> Answer | None:
+        """A frame that ended at ``time`` on a bus: the answer (row, arbitration key, raw frame, bits), or None."""
+        raise NotImplementedError
+
+    def _pack_feedback(self) -> np.ndarray:
+        """The feedback (FRAME, (n,)) of every motor."""
+        raise NotImplementedError
+
+    def _obey(self, rows: list[int], frames: np.ndarray) -> None:
+        """Take over the commands ``frames`` (FRAME, (m,)) to motors ``rows``, in their order."""
+        self._last[rows] = frames
+
+    def _targets(self) -> MotorCommand:
+        """What each motor is told to do, in its own sign and zero."""
+        raise NotImplementedError
+
+    def _configure(self) -> None:
+        """Take over what the registers hold."""
+        raise NotImplementedError
+
+    def _trip(self, row: int, now: float) -> None:
+        """The watchdog of a motor has expired."""
+        raise NotImplementedError
+
+    def _overheat(self, row: int, now: float) -> None:
+        """A motor is too hot."""
+        raise NotImplementedError
+
+    def _boot(self, row: int) -> None:
+        """A motor has power again. Single-turn encoder: it finds itself within half a turn of zero."""
+        self.zero[row] += 2 * np.pi * np.round(self.position[row] / (2 * np.pi))
+
     # -- frames ------------------------------------------------------------------------------------------------------
 
-    def receive(self, bus: int, id: int, raw: bytes, time: float) -> tuple[int, int, bytes, int] | None:
-        """A frame that ended at ``time`` on a bus: the answer (row, arbitration key, raw frame, bits), or None."""
-        row = self._rows[bus].get(id)
-        if row is None or raw[8:15] == MAGIC_PREFIX or raw[4] != 8:
-            return self._receive_rare(bus, raw, time)
-        if not (self.powered[row] and self._obeys_mit[row]):
-            return None
-        answer = self._answer(row)
-        if self._accepts[row]:
-            self._arrived.append((row, raw, time))
-        return answer
-
-    def _receive_rare(self, bus: int, raw: bytes, time: float) -> tuple[int, int, bytes, int] | None:
-        """Everything but a command."""
-        frame = np.frombuffer(raw, FRAME)
-        rows, kinds = self._decoders[bus].classify(frame)
-        row, kind = int(rows[0]) + self._first[bus], int(kinds[0])
-        if rows[0] < 0 or not self.powered[row] or kind in (Kind.COMMAND, Kind.OTHER_MODE):
-            return None
-        self._take_commands()  # what came before counts before
-        if kind == Kind.REGISTER:
-            return self._register(bus, row, frame["data"][0])
-        answer = self._answer(row)
-        if kind == Kind.ENABLE:
-            if not self.error[row]:
-                self.last_command_time[row] = time
-                self._set_deadline()
-                if not self.enabled[row]:
-                    self._set_enabled(row, True, time, "enabled")
-        elif kind == Kind.DISABLE:
-            if self.enabled[row]:
-                self._set_enabled(row, False, time, "disabled")
-        elif kind == Kind.CLEAR_ERROR:
-            if self.error[row]:
-                self.error[row] = 0
-                self._stale = True
-                self._note(time, row, "cleared")
-        elif kind == Kind.SET_ZERO:
-            self.zero[row] += self.position[row]
-            self._stale = self._changed = True
-            self._note(time, row, "zeroed")
-        return answer
-
-    def _register(self, bus: int, row: int, data: np.ndarray) -> tuple[int, int, bytes, int] | None:
-        request = damiao.unpack_register(data)
-        if request.operation == Operation.REFRESH:
-            return self._answer(row)
-        registers = self._registers[row]
-        if request.operation == Operation.STORE:
-            if self.enabled[row]:
-                return None
-            self._flash[row] = dict(registers)
-            value = 0
-        elif not request.register:
-            return None
-        elif request.operation == Operation.WRITE and damiao.REGISTERS[request.register][2]:
-            registers[request.register] = request.value
-            self._configure()
-        value = registers[request.register] if request.register else 0
-        frame = make_frames(
-            np.array([self.specs[row].feedback_id], np.uint32),
-            damiao.pack_register(self.specs[row].id, request.operation, request.register, value)[None],
-        )
-        return row, self._keys[row], frame.tobytes(), int(self._frame_bits(frame)[0])
-
-    def _answer(self, row: int) -> tuple[int, int, bytes, int]:
+    def _answer(self, row: int) -> Answer:
+        """The feedback of one motor."""
         if self._stale:
             self.refresh()
         return row, self._keys[row], self._feedback[16 * row : 16 * row + 16], self._bits[row]
@@ -215,16 +185,7 @@ class SimMotors:
         if not self._stale:
             return self._frame_bits(np.frombuffer(raw, FRAME)).tolist() if raw else []
         self._stale = False
-        feedback = self._codec.pack_feedback(
-            self.position,
-            self._sign * self._body.joint_vel,
-            self._sign * self._body.joint_torque,
-            np.where(self.error, self.error, self.enabled),
-            self.driver_temperature,
-            self.rotor_temperature,
-            self._wrap,
-        )
-        self._feedback = feedback.tobytes()
+        self._feedback = self._pack_feedback().tobytes()
         bits = self._frame_bits(np.frombuffer(raw + self._feedback, FRAME)).tolist()
         self._bits = bits[-len(self.specs) :]
         return bits[: -len(self.specs)]
@@ -263,8 +224,9 @@ class SimMotors:
             return
         rows, raws, times = map(list, zip(*self._arrived, strict=True))
         self._arrived.clear()
-        self._data[rows] = np.frombuffer(b"".join(raws), FRAME)["data"]
+        self._obey(rows, np.frombuffer(b"".join(raws), FRAME))
         self.last_command_time[rows] = times
+        self._fed[rows] = times
         self._commanded[rows] = True
         self._taken += zip(rows, times, strict=True)
         self._changed = True
@@ -272,7 +234,7 @@ class SimMotors:
 
     def _decide(self) -> np.ndarray:
         """The law (3, n) that the motors' targets and states make: bias, kp, kd at the joints."""
-        c = self._codec.unpack_command(self._data)
+        c = self._targets()
         on = self.enabled & self._commanded
         bias = c.kp * (c.position - self._offset + self.zero) + c.kd * c.velocity + c.torque
         law = np.array([self._sign * bias, c.kp, c.kd]) * on
@@ -285,11 +247,10 @@ class SimMotors:
         return law
 
     def _expire(self, now: float) -> None:
-        """Watchdogs whose time is up disable their motors."""
-        late = self.enabled & (now - self.last_command_time >= self._timeout)
+        """Watchdogs whose time is up trip."""
+        late = self.enabled & (now - self._fed >= self._timeout)
         for row in np.flatnonzero(late):
-            self.error[row] = damiao.LOST_COMMUNICATION
-            self._set_enabled(int(row), False, now, "watchdog")
+            self._trip(int(row), now)
         self._set_deadline()
 
     def _warm(self, now: float) -> None:
@@ -302,14 +263,13 @@ class SimMotors:
             temperature += (AMBIENT + rise * heat - temperature) * (THERMAL_PERIOD / tau)
         hot = (self.rotor_temperature > self._rotor_limit) | (self.driver_temperature > DRIVER_LIMIT)
         for row in np.flatnonzero(hot & self.enabled):
-            self.error[row] = 0xC if self.rotor_temperature[row] > self._rotor_limit[row] else 0xB
-            self._set_enabled(int(row), False, now, "over-temperature")
+            self._overheat(int(row), now)
 
     # -- state -------------------------------------------------------------------------------------------------------
 
     def power(self, row: int, on: bool, time: float) -> None:
         """Take a motor's supply away, or give it back: it then starts from its flash, disabled, and has lost its count
-        of turns (single-turn encoder: it finds itself within half a turn of zero)."""
+        of turns."""
         if self.powered[row] == on:
             return
         self._take_commands()
@@ -318,7 +278,7 @@ class SimMotors:
         if on:
             self.error[row] = 0
             self._registers[row] = dict(self._flash[row])
-            self.zero[row] += 2 * np.pi * np.round(self.position[row] / (2 * np.pi))
+            self._boot(row)
             self._configure()
 
     def register(self, joint: str, name: str) -> float:
@@ -333,7 +293,6 @@ class SimMotors:
             self._arrived = [a for a in self._arrived if a[0] != row]
             self._effect[row] = OFF
             self._changed = True
-        self._accepts[row] = on
         self._note(time, row, event)
         self._set_deadline()
 
@@ -341,40 +300,5 @@ class SimMotors:
         self.log.append(MotorEvent(time, self.bus_names[row], self.joints[row], event))
 
     def _set_deadline(self) -> None:
-        due = self.last_command_time[self.enabled] + self._timeout[self.enabled]
+        due = self._fed[self.enabled] + self._timeout[self.enabled]
         self._deadline = float(due.min()) if len(due) else np.inf
-
-    def _configure(self) -> None:
-        """Take over what the registers hold."""
-        column = lambda name: np.array([r[name] for r in self._registers], float)  # noqa: E731
-        n = len(self.specs)
-        ranges = Ranges(
-            column("PMAX"), column("VMAX"), column("TMAX"), np.full(n, damiao.KP_MAX), np.full(n, damiao.KD_MAX)
-        )
-        self._codec = damiao.DamiaoMotors(self._all, ranges)
-        self._rated = RATED_SHARE * ranges.torque
-        self._rotor_limit = column("OT_VALUE")
-        ticks = column("TIMEOUT")
-        self._timeout = np.where(ticks > 0, ticks * damiao.TIMEOUT_TICK, np.inf)
-        self._obeys_mit = (column("CTRL_MODE") == damiao.MIT_MODE).tolist()
-        self._accepts = self.enabled.tolist()
-        self._body.limit(ranges.torque)
-        self._stale = True
-        self._changed = True
-        self._set_deadline()
-
-
-def _factory_registers(spec, ranges: Ranges, row: int) -> dict[str, float | int]:
-    registers: dict[str, float | int] = {name: 0 for name in damiao.REGISTERS}
-    registers |= {
-        "ESC_ID": spec.id,
-        "MST_ID": spec.feedback_id,
-        "CTRL_MODE": damiao.MIT_MODE,
-        "TIMEOUT": 0,
-        "CAN_BR": 4,
-        "OT_VALUE": ROTOR_LIMIT,
-        "PMAX": float(ranges.position[row]),
-        "VMAX": float(ranges.velocity[row]),
-        "TMAX": float(ranges.torque[row]),
-    }
-    return registers

@@ -24,6 +24,7 @@ import numpy as np
 
 from drivers.budget import frame_bits
 from drivers.bus import BusError, BusSpec, ImuSpec
+from drivers.open import PROTOCOLS, load
 from drivers.sim.faults import IMU, POWER, Fault, parse_fault
 from drivers.sim.imu import ImuNoise, SimImu, SimSerialWire
 from drivers.sim.motor import MotorEvent, SimMotors
@@ -66,7 +67,7 @@ class World:
         self.time = 0.0
         self.plant = Plant(model_path, joints, base, timestep, prepare, imu.site)
         self.plant.reset(joint_pos, hang=hang, noise=noise, seed=seed)
-        self.motors = SimMotors(buses, self.plant, frame_bits, registers=registers, wrap=wrap)
+        self.motors = _motors_of(buses)(buses, self.plant, frame_bits, registers=registers, wrap=wrap)
         self.buses: list[SimCan] = []
         first = 0
         for i, spec in enumerate(buses):
@@ -220,3 +221,19 @@ class World:
 
     def truth(self) -> Truth:
         return self.plant.truth()
+
+
+def _motors_of(buses: Sequence[BusSpec]) -> type[SimMotors]:
+    """The class of emulated motors that ``buses`` need. Raises BusError."""
+    emulated = {name: p.motors for name, p in PROTOCOLS.items() if p.wire == "can" and p.motors}
+    for spec in buses:
+        if spec.protocol not in emulated:
+            raise BusError(
+                f"bus {spec.name}: no emulated motors for '{spec.protocol}', expected one of {', '.join(emulated)}"
+            )
+        if spec.protocol != buses[0].protocol:
+            raise BusError(
+                f"bus {spec.name}: got protocol '{spec.protocol}', expected '{buses[0].protocol}' as on bus "
+                f"{buses[0].name}: a simulated robot has one CAN protocol"
+            )
+    return load(emulated[buses[0].protocol])
