@@ -93,6 +93,10 @@ def main(argv: list[str]) -> int:
 def _check(args: Args, config: RobotConfig) -> None:
     if args.hardware and args.clock == "lockstep":
         raise Sim2realError("--hardware with --clock lockstep: a real robot runs in real time; drop one of the two")
+    if args.hardware and args.operator != "keyboard":
+        raise Sim2realError(
+            "--hardware with a script: a person arms a real robot, and stops it; add --operator keyboard"
+        )
     if args.hardware and (args.fault or args.video):
         raise Sim2realError("--hardware with --fault or --video: those exist only in simulation; drop them")
     if args.visuals and not args.video:

@@ -54,14 +54,17 @@ WRONG = {
     "both": (["--robot", "g1", "--policy", "POLICY", "--skill", "stand", "--script", "stand:1"], "expected one"),
     "velocity of nothing": (["--robot", "g1", "--policy", "POLICY", "--velocity", "1", "0", "0"], "add --skill"),
     "lockstep hardware": (["--robot", "g1", "--hardware", "--clock", "lockstep"], "real time"),
-    "faulty hardware": (["--robot", "g1", "--hardware", "--fault", "drop:0.1"], "only in simulation"),
+    "faulty hardware": (
+        ["--robot", "g1", "--hardware", "--operator", "keyboard", "--fault", "drop:0.1"],
+        "only in simulation",
+    ),
     "unknown fault": (
         ["--robot", "g1", "--policy", "POLICY", "--skill", "stand", "--clock", "lockstep", "--fault", "drp:0.1"],
         "drop",
     ),
     "keyboard in lockstep": (["--robot", "g1", "--operator", "keyboard", "--clock", "lockstep"], "realtime"),
     "no terminal": (["--robot", "g1", "--policy", "POLICY", "--operator", "keyboard"], "no terminal"),
-    "no hardware": (["--robot", "g1", "--policy", "POLICY", "--hardware", "--no-record"], "can0"),
+    "unattended hardware": (["--robot", "g1", "--policy", "POLICY", "--hardware"], "a person arms"),
 }
 
 
