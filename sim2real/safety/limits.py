@@ -105,7 +105,6 @@ class Limiter:
         self.limits = limits
         self.low, self.high = limits.low(), limits.high()
         self.targets = np.zeros_like(self.low)
-        self.rest()
 
     def rest(self) -> None:
         """All zero, or the nearest to it that the soft range allows: motors that obey this make no torque."""
