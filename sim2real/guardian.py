@@ -60,10 +60,9 @@ class Guardian:
     ``tell`` receives a sentence for the operator whenever something was refused or went wrong.
     """
 
-    response_share = (
-        0.35  # of a tick, between sensing and acting: the pilot's answer goes out in the tick it belongs to,
-    )
-    # and the motors' replies are still back before the next
+    # Share of a tick between sensing and acting: the pilot's answer goes out in the tick it belongs to, and the motors'
+    # replies are still back before the next.
+    response_share = 0.35
     enable_time = 0.3  # s for every motor to answer that it is enabled
     damp_time = 1.5  # s of damping at the end of a run before the motors are switched off
 
@@ -129,10 +128,13 @@ class Guardian:
         self._store(command, calls | self._failed, (start, judged, clock.now()))
         self._tick += 1
 
-    def stop_at_once(self) -> None:
-        """The way out when nothing else can be trusted: disable every motor. Never raises."""
-        self.safety.off()
-        self.robot.disable()
+    def damp_at_once(self) -> None:
+        """The way out when something unforeseen happened: damping, whatever else is broken. Never raises."""
+        try:
+            self.safety.stop(self._state.time)
+            self._transmit(self.safety.step(self._state, None, self.clock.now()))
+        except Exception:  # noqa: BLE001 - the motors' watchdogs are next
+            self.robot.disable()
 
     def quit(self) -> None:
         """Damp, then switch off and be ``done``. Safe to call again and again."""
@@ -277,9 +279,11 @@ def main(directory: Path) -> int:
 
     try:
         keep_time(guardian.tick, guardian.period, spec, 80, goes_on)
-    finally:
-        guardian.stop_at_once()
-        robot.close()
+    except BaseException:
+        guardian.damp_at_once()  # the launcher goes on damping when it sees us die
+        raise
+    robot.disable()
+    robot.close()
     return 0
 
 
