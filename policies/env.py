@@ -197,7 +197,7 @@ class Env(VecEnv):
     def _adapt(self, survived: int, fell: int) -> None:
         """Push harder while about two episodes of three survive."""
         if self.adaptive and self.level is not None:
-            self.level = float(np.clip(self.level + 0.0005 * (survived - 2 * fell), 0.0, 1.0))
+            self.level = float(np.clip(self.level + 0.002 * (survived - 2 * fell), 0.0, 1.0))
 
     def _start(self, ids: np.ndarray) -> None:
         """New robots in ``ids``, each inside some motion at some phase, or at home."""

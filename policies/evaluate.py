@@ -3,16 +3,46 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from policies.basics import Basics
 from policies.env import Env
 from policies.graph import PolicyGraph
+from sim2real.policy import Policy, load_policy
+from sim2real.types import Sim2realError
 
 UNSEEN = 900_000  # seeds from here on are never trained on
+Actor = Callable[[Env], Tensor]  # what to do in every robot of an environment: actions (envs, driven)
+
+
+class Rate(NamedTuple):
+    """``survived`` of ``episodes``."""
+
+    survived: int
+    episodes: int
+
+    @property
+    def value(self) -> float:
+        return self.survived / self.episodes
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % confidence of a binomial share (Wilson 1927, JASA 22:209, eq. 2)."""
+        z, n, p = 1.96, self.episodes, self.value
+        centre = (p + z * z / (2 * n)) / (1 + z * z / n)
+        half = z / (1 + z * z / n) * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+        return float(max(0.0, centre - half)), float(min(1.0, centre + half))
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        return f"{self.value:.1%} ({low:.1%} to {high:.1%}, {self.episodes} episodes)"
 
 
 class Episodes(NamedTuple):
@@ -21,8 +51,48 @@ class Episodes(NamedTuple):
     survived: np.ndarray  # (episodes,) bool
     error: np.ndarray  # (episodes,) rad, mean distance of the joints from their reference
 
+    def rate(self, where: np.ndarray | slice = slice(None)) -> Rate:
+        chosen = self.survived[where]
+        return Rate(int(chosen.sum()), len(chosen))
 
-def run_episodes(config: Basics, graph: PolicyGraph, script: np.ndarray, push: float = 0.0, seed: int = 0) -> Episodes:
+
+class FileActor:
+    """A policy file in every robot of an environment, fed what a robot would measure, each with a memory of its own.
+
+    The environment turns actions into targets; Sim2realError if the file's own targets are others, because it was made
+    with other settings than ``policies.basics`` holds now.
+    """
+
+    def __init__(self, path: Path, robots: int) -> None:
+        self.path = path
+        self.policies: list[Policy] = [load_policy(path, trial=0) for _ in range(robots)]
+
+    def __call__(self, env: Env) -> Tensor:
+        signals = {name: signal.numpy() for name, signal in env.signals.items()}
+        born = env.episode_length_buf.numpy() == 0
+        actions = np.zeros((env.num_envs, env.num_actions), np.float32)
+        targets = np.zeros((env.num_envs, env.model.nu), np.float32)
+        for k, policy in enumerate(self.policies[: env.num_envs]):
+            if born[k]:
+                policy.reset()
+            outputs = policy.step({name: rows[k] for name, rows in signals.items()})
+            actions[k], targets[k] = outputs["action"], outputs["joint_pos_target"]
+        result = torch.from_numpy(actions)
+        error = float((env.graph.target(env.measured, result) - torch.from_numpy(targets)).abs().max())
+        if not error < 1e-3:
+            raise Sim2realError(
+                f"{self.path}: its targets are up to {error:.2g} rad off those of policies/basics.py for the same actions,"
+                " expected the same; it was made with other settings: export it again (sim2real train --export)"
+            )
+        return result
+
+
+def graph_actor(graph: PolicyGraph) -> Actor:
+    """The torch policy, on the environment's own observation."""
+    return lambda env: graph.actor(env.observation)
+
+
+def run_episodes(config: Basics, actor: Actor, script: np.ndarray, push: float = 0.0, seed: int = 0) -> Episodes:
     """One episode per row of ``script`` (episodes, ticks) of label indices, under randomisation that training never saw.
 
     ``push``: m/s, the largest of random pushes every ``config.push`` seconds; 0: none.
@@ -33,10 +103,24 @@ def run_episodes(config: Basics, graph: PolicyGraph, script: np.ndarray, push: f
     errors = np.zeros((script.shape[1], len(script)))
     with torch.no_grad():
         for t in range(script.shape[1]):
-            env.step(graph.actor(env.observation))
+            env.step(actor(env))
             survived &= ~env.failures
             errors[t] = np.abs(env.tick.joint_pos - env.tick.reference).mean(axis=-1)
     return Episodes(survived, errors.mean(axis=0))
+
+
+def skill_script(config: Basics, labels: int, episodes: int, seconds: float) -> np.ndarray:
+    """(labels * episodes, ticks): ``episodes`` of each label, one label throughout."""
+    return np.repeat(np.arange(labels), episodes)[:, None].repeat(round(seconds / config.period), axis=1)
+
+
+def switch_script(config: Basics, labels: int, episodes: int) -> tuple[list[tuple[int, int]], np.ndarray]:
+    """Every ordered pair of labels, and (pairs * episodes, ticks): 2 to 4 s of the first, then the second, 8 s in all."""
+    pairs = list(itertools.permutations(range(labels), 2))
+    ticks = round(8.0 / config.period)
+    switch = np.random.default_rng(0).integers(ticks // 4, ticks // 2, len(pairs) * episodes)
+    first, second = np.repeat(pairs, episodes, axis=0).T
+    return pairs, np.where(np.arange(ticks) < switch[:, None], first[:, None], second[:, None])
 
 
 def random_script(
@@ -52,9 +136,9 @@ def random_script(
 def quick_survival(config: Basics, graph: PolicyGraph) -> dict[str, float]:
     """The two rates that training selects by: 10 s of random skills, without and with pushes up to 0.5 m/s."""
     script = random_script(config, len(graph.labels), config.evaluate_envs, 10.0)
-    calm, pushed = (run_episodes(config, graph, script, push) for push in (0.0, 0.5))
+    calm, pushed = (run_episodes(config, graph_actor(graph), script, push) for push in (0.0, 0.5))
     return {
-        "survival": float(calm.survived.mean()),
-        "survival_pushed": float(pushed.survived.mean()),
+        "survival": calm.rate().value,
+        "survival_pushed": pushed.rate().value,
         "joint_error": float(calm.error.mean()),
     }

@@ -86,12 +86,12 @@ def healthy_values(graph: PolicyGraph, episodes: int = 8, ticks: int = 300) -> t
     return values / weights
 
 
-def training_signals(graph: PolicyGraph, ticks: int = 600) -> Iterator[dict[str, np.ndarray]]:
-    """What the policy measures in training, pushes and all, every tenth tick."""
-    env = Env(dataclasses.replace(graph.config, envs=64), UNSEEN + 2, level=1.0)
+def training_signals(graph: PolicyGraph, ticks: int = 300) -> Iterator[dict[str, np.ndarray]]:
+    """What the policy measures in training, pushes and all, every fifth tick."""
+    env = Env(dataclasses.replace(graph.config, envs=48), UNSEEN + 2, level=1.0)
     with torch.no_grad():
         for t in range(ticks):
-            if t % 10 == 0:
+            if t % 5 == 0:
                 yield {name: signal.numpy().copy() for name, signal in env.signals.items()}
             env.step(graph.actor(env.observation))
 

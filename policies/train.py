@@ -80,10 +80,6 @@ class Training:
     def step(self) -> dict[str, float]:
         """One iteration: collect ``horizon`` ticks, update. Returns a row of the curve."""
         config, ppo, env = self.config, self.ppo, self.env
-        first, last = config.learning_rate
-        ppo.learning_rate = first + (last - first) * min(1.0, self.samples / config.samples)
-        for group in ppo.optimizer.param_groups:
-            group["lr"] = ppo.learning_rate
         ppo.train_mode()
         total, survived, fell = 0.0, 0, 0
         with torch.no_grad():
@@ -173,7 +169,7 @@ def make_ppo(config: Basics, env: Env, rank: int = 0, world: int = 1) -> PPO:
         "algorithm": {
             "class_name": "PPO",
             "gamma": config.gamma,
-            "learning_rate": config.learning_rate[0],
+            "learning_rate": config.learning_rate,
             **config.ppo,
         },
         "multi_gpu": {"global_rank": rank, "local_rank": rank, "world_size": world} if world > 1 else None,

@@ -108,9 +108,9 @@ def test_pushes_change_the_base_s_velocity_and_none_means_none():
 def test_the_curriculum_rises_with_survival_and_falls_faster():
     env = Env(CONFIG, seed=0, level=0.5)
     env._adapt(10, 0)
-    assert env.level == pytest.approx(0.505)
+    assert env.level == pytest.approx(0.52)
     env._adapt(0, 10)
-    assert env.level == pytest.approx(0.495)
+    assert env.level == pytest.approx(0.48)
     env._adapt(0, 10_000)
     assert env.level == 0.0
 

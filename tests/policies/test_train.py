@@ -56,9 +56,3 @@ def test_a_run_leaves_its_config_and_curve(tmp_path):
 def test_no_checkpoint_is_refused_with_the_next_step(tmp_path):
     with pytest.raises(Sim2realError, match="sim2real train g1-basics"):
         load_graph(tmp_path)
-
-
-def test_the_learning_rate_is_annealed(tmp_path):
-    training = Training(TINY, tmp_path)
-    rates = [training.step()["learning_rate"] for _ in range(4)]
-    assert rates[0] == TINY.learning_rate[0] and rates == sorted(rates, reverse=True)
