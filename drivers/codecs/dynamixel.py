@@ -1,0 +1,675 @@
+"""Dynamixel Protocol 2.0, X series and MX with firmware 2.0: bytes to SI and back, host side and servo side.
+
+    FF FF FD 00 | id | length | instruction | parameters ... | CRC-16        length: bytes behind it, little-endian
+    a status packet has the instruction 55 and an error byte before its parameters
+
+Within instruction and parameters every FF FF FD is followed by a further FD ("stuffing"), so that no header can appear
+there. The CRC-16 (polynomial 0x8005, initial value 0, most significant bit first) runs over everything before it, stuffed.
+Source: ROBOTIS e-manual, "Protocol 2.0", and the control table pages of the models.
+
+**What a PD target becomes.** A position-controlled servo turns the goal's distance into a duty cycle,
+``pwm = P / 128 * ticks`` of 885 (e-manual, "Position PID Gain"), and a DC motor that into
+``torque = stall_torque * pwm / 885 - stall_torque / no_load_speed * velocity``. So:
+
+- ``kp`` becomes the P gain, every tick, by the model's stall torque at its nominal voltage (MODELS); its step is
+  stall_torque / 174 rad (0.02 N m/rad for an XM430-W350). Off that voltage the torque scales with the supply.
+- ``kd`` has no register: the D gain's time base is not published, and it is set to 0. What damps is the motor's own
+  back-EMF, ``damping_of(model)``, whether asked for or not, also at kp = 0: the windings are then shorted.
+- the terms ``kd * velocity + torque`` move the goal position by themselves over kp, which gives the same torque.
+
+Operating modes 3 (position, one turn) and 4 (extended position) work so. Mode 5 (current-based position) is refused: how
+its P gain relates to current is not published.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from enum import IntEnum
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from drivers.bus import BusError, BusSpec, MotorCommand, MotorState
+from drivers.serial_bus import RegisterCheck
+
+HEADER = b"\xff\xff\xfd\x00"
+BROADCAST = 0xFE
+ID_MAX = 252
+STUFFED = b"\xff\xff\xfd"
+LENGTH_MAX = 1024  # bytes behind the length field; the longest packet of 60 servos is well below
+OVERHEAD = 10  # bytes of a packet without parameters
+
+TICKS = 4096  # a turn
+TICK = 2 * np.pi / TICKS  # rad
+ZERO = 2048  # position at 0 rad
+VELOCITY_UNIT = 0.0239691227  # rad/s, as in the maker's own model files ("0.229 rpm", rounded, in the tables)
+PWM_MAX = 885  # 100 %
+GAIN_UNIT = 128  # P gain of 1 PWM unit per tick
+GAIN_MAX = 16383
+LOAD_UNIT = 0.001  # of the stall torque, where there is no current sensor
+WATCHDOG_UNIT = 0.02  # s
+WATCHDOG_TRIPPED = 0xFF  # -1 in its register
+EXTENDED_MAX = 1_048_575  # ticks, mode 4
+
+
+class Instruction(IntEnum):
+    """Eighth byte of a packet."""
+
+    PING = 0x01
+    READ = 0x02
+    WRITE = 0x03
+    REG_WRITE = 0x04
+    ACTION = 0x05
+    FACTORY_RESET = 0x06
+    REBOOT = 0x08
+    CLEAR = 0x10
+    STATUS = 0x55
+    SYNC_READ = 0x82
+    SYNC_WRITE = 0x83
+    FAST_SYNC_READ = 0x8A
+    BULK_READ = 0x92
+    BULK_WRITE = 0x93
+    FAST_BULK_READ = 0x9A
+
+
+class StatusError(IntEnum):
+    """Low seven bits of a status packet's error byte: what was wrong with the instruction."""
+
+    NONE = 0
+    RESULT_FAIL = 1
+    INSTRUCTION = 2
+    CRC = 3
+    DATA_RANGE = 4
+    DATA_LENGTH = 5
+    DATA_LIMIT = 6
+    ACCESS = 7
+
+
+ALERT = 0x80  # bit of the same byte: read HARDWARE_ERROR; the packet's data are good all the same
+HARDWARE_ERRORS = {
+    0x01: "input voltage",
+    0x04: "overheating",
+    0x08: "encoder",
+    0x10: "electrical shock",
+    0x20: "overload",
+    0x100: "bus watchdog tripped",  # not in the servo's byte: register BUS_WATCHDOG says -1
+}
+TRIPPED = 0x100
+
+
+class Model(NamedTuple):
+    """What tells models apart: number, current of one unit (A; 0: it reports load), and the motor at its nominal
+    voltage: stall torque (N m), stall current (A), no-load speed (rpm)."""
+
+    number: int
+    current: float
+    stall_torque: float
+    stall_current: float
+    no_load_speed: float
+
+
+# Source: e-manual, specifications of each model, at the voltage in the comment.
+MODELS: dict[str, Model] = {
+    "XL330-M077": Model(1190, 0.001, 0.215, 1.47, 383),  # 5 V
+    "XL330-M288": Model(1200, 0.001, 0.52, 1.47, 103),
+    "XC330-M181": Model(1230, 0.001, 0.60, 1.80, 129),
+    "XC330-M288": Model(1240, 0.001, 0.93, 1.80, 81),
+    "XC330-T181": Model(1210, 0.001, 0.80, 0.88, 113),  # 12 V from here on
+    "XC330-T288": Model(1220, 0.001, 1.00, 0.88, 71),
+    "XL430-W250": Model(1060, 0.0, 1.5, 1.4, 61),
+    "XC430-W150": Model(1070, 0.0, 1.6, 1.4, 106),
+    "XC430-W240": Model(1080, 0.0, 1.9, 1.4, 70),
+    "XM430-W210": Model(1030, 0.00269, 3.0, 2.3, 77),
+    "XM430-W350": Model(1020, 0.00269, 4.1, 2.3, 46),
+    "XM540-W150": Model(1130, 0.00269, 7.3, 4.4, 53),
+    "XM540-W270": Model(1120, 0.00269, 10.6, 4.4, 30),
+    "XH430-W210": Model(1010, 0.00269, 2.5, 1.3, 50),
+    "XH430-W350": Model(1000, 0.00269, 3.4, 1.3, 30),
+    "XW540-T140": Model(1180, 0.00269, 6.9, 4.9, 72),
+    "XW540-T260": Model(1170, 0.00269, 9.5, 4.9, 40),
+    "MX-28": Model(30, 0.0, 2.5, 1.4, 55),  # MX: firmware 2.0
+    "MX-64": Model(311, 0.00336, 6.0, 4.1, 63),
+    "MX-106": Model(321, 0.00336, 8.4, 5.2, 45),
+}
+
+
+class Register(NamedTuple):
+    """An item of the control table. Values outside ``low`` to ``high`` are refused by the servo."""
+
+    address: int
+    size: int
+    low: int = 0
+    high: int = -1  # -1: read-only
+    default: int = 0
+
+
+RAM = 64  # first address that can be written while torque is on
+INDIRECT_ADDRESS, INDIRECT_DATA = 168, 224  # of the first indirect register: 2 bytes of address, 1 byte of data
+INDIRECT_COUNT = 20  # what the smallest models have
+
+REGISTERS: dict[str, Register] = {
+    "MODEL": Register(0, 2),
+    "FIRMWARE": Register(6, 1, default=45),
+    "ID": Register(7, 1, 0, ID_MAX),
+    "BAUD": Register(8, 1, 0, 7, 1),
+    "RETURN_DELAY": Register(9, 1, 0, 254, 250),  # 2 us
+    "DRIVE_MODE": Register(10, 1, 0, 13),
+    "OPERATING_MODE": Register(11, 1, 0, 16, 3),
+    "SHADOW_ID": Register(12, 1, 0, 255, 255),
+    "HOMING_OFFSET": Register(20, 4, -1_044_479, 1_044_479),
+    "TEMPERATURE_LIMIT": Register(31, 1, 0, 100, 80),  # deg C
+    "PWM_LIMIT": Register(36, 2, 0, PWM_MAX, PWM_MAX),
+    "CURRENT_LIMIT": Register(38, 2, 0, 2047, 1193),
+    "VELOCITY_LIMIT": Register(44, 4, 0, 2047, 200),
+    "POSITION_MAX": Register(48, 4, 0, TICKS - 1, TICKS - 1),
+    "POSITION_MIN": Register(52, 4, 0, TICKS - 1, 0),
+    "SHUTDOWN": Register(63, 1, 0, 63, 52),  # errors that switch torque off until a reboot
+    "TORQUE_ENABLE": Register(64, 1, 0, 1),
+    "LED": Register(65, 1, 0, 1),
+    "STATUS_RETURN_LEVEL": Register(68, 1, 0, 2, 2),
+    "HARDWARE_ERROR": Register(70, 1),
+    "POSITION_D_GAIN": Register(80, 2, 0, GAIN_MAX),
+    "POSITION_I_GAIN": Register(82, 2, 0, GAIN_MAX),
+    "POSITION_P_GAIN": Register(84, 2, 0, GAIN_MAX, 800),
+    "BUS_WATCHDOG": Register(98, 1, 0, 127),
+    "GOAL_PWM": Register(100, 2, -PWM_MAX, PWM_MAX, PWM_MAX),
+    "GOAL_CURRENT": Register(102, 2, -2047, 2047, 1193),
+    "GOAL_VELOCITY": Register(104, 4, -2047, 2047),
+    "PROFILE_ACCELERATION": Register(108, 4, 0, 32767),
+    "PROFILE_VELOCITY": Register(112, 4, 0, 32767),
+    "GOAL_POSITION": Register(116, 4, -EXTENDED_MAX, EXTENDED_MAX),
+    "REALTIME_TICK": Register(120, 2),  # ms
+    "PRESENT_CURRENT": Register(126, 2),
+    "PRESENT_VELOCITY": Register(128, 4),
+    "PRESENT_POSITION": Register(132, 4),
+    "PRESENT_VOLTAGE": Register(144, 2),  # 0.1 V
+    "PRESENT_TEMPERATURE": Register(146, 1),  # deg C
+    "INDIRECT": Register(INDIRECT_ADDRESS, 2 * INDIRECT_COUNT, 0, 2 ** (16 * INDIRECT_COUNT)),  # all addresses at once
+}
+
+# What indirect registers gather: the goal of a tick, and behind it the state that is read back.
+GOAL = ("POSITION_P_GAIN", "GOAL_POSITION")
+STATE = ("TORQUE_ENABLE", "HARDWARE_ERROR", "BUS_WATCHDOG", "PRESENT_CURRENT", "PRESENT_VELOCITY", "PRESENT_POSITION",
+         "PRESENT_TEMPERATURE")  # fmt: skip
+GOAL_SIZE = sum(REGISTERS[name].size for name in GOAL)
+STATE_SIZE = sum(REGISTERS[name].size for name in STATE)
+GOAL_AT, STATE_AT = INDIRECT_DATA, INDIRECT_DATA + GOAL_SIZE
+MAPPED = [a for name in GOAL + STATE for a in range(REGISTERS[name].address, sum(REGISTERS[name][:2]))]
+INDIRECT_VALUE = int.from_bytes(np.array(MAPPED, "<u2").tobytes(), "little")
+assert len(MAPPED) == INDIRECT_COUNT
+
+GOAL_ITEM = np.dtype([("id", "u1"), ("p_gain", "<u2"), ("position", "<i4")])
+STATE_FIELDS = [("torque_enable", "u1"), ("error", "u1"), ("watchdog", "u1"), ("current", "<i2"), ("velocity", "<i4"),
+                ("position", "<i4"), ("temperature", "u1")]  # fmt: skip
+STATE_ITEM = np.dtype(STATE_FIELDS)
+STATUS = np.dtype([("head", "<u8"), ("alert", "u1"), ("state", STATE_ITEM), ("crc", "<u2")])
+FAST_ITEM = np.dtype([("alert", "u1"), ("id", "u1"), ("state", STATE_ITEM), ("crc", "<u2")])
+_ID_MASK = 0xFF << 32
+_STATUS_HEAD = int.from_bytes(HEADER + bytes([0, STATE_SIZE + 4, 0, Instruction.STATUS]), "little")
+BAUD_RATES = {0: 9600, 1: 57600, 2: 115200, 3: 1_000_000, 4: 2_000_000, 5: 3_000_000, 6: 4_000_000, 7: 4_500_000}
+FIRMWARE_MIN = 38  # the first with a bus watchdog
+
+
+# -- packets ---------------------------------------------------------------------------------------------------------
+
+
+@cache
+def _crc_table() -> np.ndarray:
+    """(LENGTH_MAX + 8, 256) uint16: what a byte adds to the CRC, by its place; the last row is the last byte.
+
+    With an initial value of 0 the CRC is linear over GF(2): that of a packet is the exclusive or of those of its bytes.
+    """
+    crc = np.arange(256, dtype=np.uint32) << 8
+    rows = []
+    for _ in range(LENGTH_MAX + 8):
+        for _ in range(8):
+            crc = (crc << 1 ^ np.where(crc & 0x8000, 0x8005, 0)) & 0xFFFF
+        rows.append(crc.astype(np.uint16))
+    return np.ascontiguousarray(rows[::-1]).reshape(-1)
+
+
+@cache
+def _places(length: int) -> np.ndarray:
+    """Where the rows of ``length`` bytes begin in the flat table."""
+    return (np.arange(length) + LENGTH_MAX + 8 - length) * 256
+
+
+def crc16(data: bytes | np.ndarray) -> int:
+    """CRC-16 of ``data``, at most LENGTH_MAX + 8 bytes."""
+    values = np.frombuffer(data, np.uint8)
+    return int(np.bitwise_xor.reduce(_crc_table().take(values + _places(len(values))), initial=0))
+
+
+def crc16_rows(data: np.ndarray) -> np.ndarray:
+    """CRC-16 (m,) uint16 of each row of ``data`` (m, length) uint8."""
+    return np.bitwise_xor.reduce(_crc_table().take(data + _places(data.shape[1])), axis=1)
+
+
+def stuff(body: bytes) -> bytes:
+    """Instruction and parameters as they go onto the wire."""
+    return body.replace(STUFFED, STUFFED + b"\xfd")
+
+
+def unstuff(body: bytes) -> bytes:
+    """The inverse of ``stuff``."""
+    return body.replace(STUFFED + b"\xfd", STUFFED)
+
+
+def pack(id: int, instruction: int, parameters: bytes = b"") -> bytes:
+    """One packet. Raises ValueError if it is longer than LENGTH_MAX."""
+    body = stuff(bytes([instruction]) + parameters)
+    length = len(body) + 2
+    if length > LENGTH_MAX:
+        raise ValueError(f"packet to {id}: got a length of {length}, expected at most {LENGTH_MAX}")
+    packet = HEADER + bytes([id]) + length.to_bytes(2, "little") + body
+    return packet + crc16(packet).to_bytes(2, "little")
+
+
+def pack_status(id: int, error: int, parameters: bytes = b"") -> bytes:
+    """A servo's answer."""
+    return pack(id, Instruction.STATUS, bytes([error]) + parameters)
+
+
+def pack_read(id: int, address: int, size: int) -> bytes:
+    return pack(id, Instruction.READ, np.array([address, size], "<u2").tobytes())
+
+
+def pack_write(id: int, address: int, data: bytes) -> bytes:
+    return pack(id, Instruction.WRITE, address.to_bytes(2, "little") + data)
+
+
+def pack_sync_read(ids: bytes, address: int, size: int, fast: bool = False) -> bytes:
+    """Ask ``ids`` for the same ``size`` bytes; they answer in this order. ``fast``: all in one status packet."""
+    instruction = Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ
+    return pack(BROADCAST, instruction, np.array([address, size], "<u2").tobytes() + ids)
+
+
+def pack_sync_write(address: int, items: np.ndarray | bytes, size: int) -> bytes:
+    """``items``: for each servo its id and ``size`` bytes. Nobody answers."""
+    return pack(BROADCAST, Instruction.SYNC_WRITE, np.array([address, size], "<u2").tobytes() + bytes(items))
+
+
+def pack_bulk_read(requests: list[tuple[int, int, int]], fast: bool = False) -> bytes:
+    """Ask each (id, address, size) for something else; they answer in this order."""
+    item = np.dtype([("id", "u1"), ("address", "<u2"), ("size", "<u2")])
+    instruction = Instruction.FAST_BULK_READ if fast else Instruction.BULK_READ
+    return pack(BROADCAST, instruction, np.array(requests, item).tobytes())
+
+
+def pack_bulk_write(writes: list[tuple[int, int, bytes]]) -> bytes:
+    """Write each (id, address, data). Nobody answers."""
+    parts = [bytes([i]) + np.array([a, len(d)], "<u2").tobytes() + d for i, a, d in writes]
+    return pack(BROADCAST, Instruction.BULK_WRITE, b"".join(parts))
+
+
+class Packet(NamedTuple):
+    """A packet whose CRC is right, without stuffing. ``end``: how many bytes of the last ``feed`` it took."""
+
+    id: int
+    instruction: int
+    parameters: bytes  # of a status packet: the error byte first
+    end: int = 0
+    raw: bytes = b""  # as it was on the wire
+
+
+class Parser:
+    """Finds packets in a byte stream: split, joined, damaged or between other bytes. Keeps at most one packet back."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+        self.rejected = 0  # packets cut short, or whose CRC or length was wrong
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """Every packet completed by ``data``, oldest first."""
+        buffer = self._bytes
+        old = len(buffer)
+        buffer += data
+        packets = []
+        at = 0
+        while (start := buffer.find(HEADER, at)) >= 0:
+            at = start
+            if len(buffer) < at + 7:
+                break
+            length = buffer[at + 5] | buffer[at + 6] << 8
+            end = at + 7 + length
+            if 3 <= length <= LENGTH_MAX:
+                if len(buffer) < end:
+                    # Stuffing keeps headers out of packets: another one means that this packet was cut short.
+                    if (start := buffer.find(HEADER, at + 7)) < 0:
+                        break
+                    self.rejected += 1
+                    at = start
+                    continue
+                raw = bytes(buffer[at:end])
+                if crc16(raw[:-2]) == raw[-2] | raw[-1] << 8:
+                    body = raw[7:-2]
+                    if raw[4] != BROADCAST or body[0] != Instruction.STATUS:  # not a fast read's answer, see below
+                        body = unstuff(body)
+                    packets.append(Packet(raw[4], body[0], body[1:], end - old, raw))
+                    at = end
+                    continue
+            self.rejected += 1
+            at += len(HEADER)  # what looked like a header may hide a real one: search on right behind it
+        else:
+            # Nothing begins in the rest, but a header may in its last three bytes.
+            at = next((len(buffer) - k for k in (3, 2, 1) if buffer.endswith(HEADER[:k])), len(buffer))
+        del buffer[:at]
+        return packets
+
+    @property
+    def pending(self) -> bytes:
+        """Bytes of a packet that is not complete yet."""
+        return bytes(self._bytes)
+
+    def clear(self) -> None:
+        """Forget what is not complete yet."""
+        self._bytes.clear()
+
+
+# -- units -----------------------------------------------------------------------------------------------------------
+
+
+def gain_scale(model: Model) -> float:
+    """P gain per N m/rad."""
+    return GAIN_UNIT * PWM_MAX * TICK / model.stall_torque
+
+
+def damping_of(model: Model) -> float:
+    """N m s/rad of a servo whose torque is on: its back-EMF at nominal voltage."""
+    return model.stall_torque / (model.no_load_speed * 2 * np.pi / 60)
+
+
+def torque_scale(model: Model) -> float:
+    """N m per unit of PRESENT_CURRENT (of PRESENT_LOAD, where the model has no current sensor)."""
+    return model.current * model.stall_torque / model.stall_current or LOAD_UNIT * model.stall_torque
+
+
+def watchdog_ticks(seconds: float) -> int:
+    """Value of BUS_WATCHDOG for ``seconds``, rounded down, at least one tick: 0 would switch it off."""
+    return min(127, max(1, int(seconds / WATCHDOG_UNIT + 1e-9)))
+
+
+# -- the host's side -------------------------------------------------------------------------------------------------
+
+
+class DynamixelCodec:
+    """Packets for the servos of one bus, and what their answers say (a ``serial_bus.SerialCodec``)."""
+
+    # Bits of one servo's share of a tick, ten a byte: its goal, its place in the request, its answer; and the packets
+    # around these. Worst: every third byte of the payloads calls for stuffing.
+    TICK_BITS = (
+        10.0 * (GOAL_ITEM.itemsize + 1 + STATUS.itemsize),
+        10.0 * (GOAL_ITEM.itemsize + 1 + STATUS.itemsize + 6),
+    )
+    TICK_OVERHEAD_BITS = 10.0 * 2 * (OVERHEAD + 4)
+    ERROR_REGISTER = "HARDWARE_ERROR"
+    HAS_FAST_READ = True
+
+    def __init__(self, spec: BusSpec) -> None:
+        """Raises BusError for an unknown model, an id that cannot be, or a bit rate that no servo has."""
+        self._spec = spec
+        self.models = models_of(spec)
+        self.ids = _ids_of(spec)
+        n = len(self.ids)
+        self.checks = _checks(spec, self.models)
+        self.rejected = 0  # answers that failed a check, or came from nobody on this bus
+        self._row_of = np.full(256, -1, np.intp)
+        self._row_of[self.ids] = np.arange(n)
+        self._gain = np.array([gain_scale(m) for m in self.models])
+        self._torque = np.array([torque_scale(m) for m in self.models])
+        self._low, self._high = np.zeros(n), np.full(n, TICKS - 1.0)
+        self._parser = Parser()
+        head = np.array([GOAL_AT, GOAL_SIZE], "<u2").tobytes()
+        length = 3 + len(head) + n * GOAL_ITEM.itemsize
+        prefix = HEADER + bytes([BROADCAST]) + length.to_bytes(2, "little") + bytes([Instruction.SYNC_WRITE]) + head
+        self._goal_packet = np.frombuffer(prefix + bytes(n * GOAL_ITEM.itemsize), np.uint8).copy()
+        self._goals = self._goal_packet[len(prefix) :].view(GOAL_ITEM)
+        self._goals["id"] = self.ids
+        self._fast_rows = np.zeros(0, np.intp)  # of the last fast request, in its order
+
+    # -- to the servos -----------------------------------------------------------------------------------------------
+
+    def pack_command(self, command: MotorCommand) -> bytes:
+        """P gains and goal positions of all servos in one sync write. Saturates at the ranges of gain and position;
+        raises ValueError for a value not finite."""
+        c = command
+        if not np.isfinite([c.position, c.velocity, c.kp, c.kd, c.torque]).all():
+            raise ValueError(
+                f"bus {self._spec.name}: got a command that is not finite, expected numbers; nothing was sent"
+            )
+        with np.errstate(over="ignore"):
+            shift = np.divide(c.kd * c.velocity + c.torque, c.kp, out=np.zeros(len(self.ids)), where=c.kp > 0)
+            position = (c.position + shift) / TICK + ZERO
+        self._goals["p_gain"] = np.clip(np.rint(c.kp * self._gain), 0, GAIN_MAX)
+        self._goals["position"] = np.clip(np.rint(position), self._low, self._high)
+        return self._sealed(self._goal_packet)
+
+    def pack_request(self, rows: np.ndarray, fast: bool = False) -> bytes:
+        """Ask the servos ``rows`` for their state, in this order."""
+        self._fast_rows = rows if fast else rows[:0]
+        return pack_sync_read(self.ids[rows].tobytes(), STATE_AT, STATE_SIZE, fast)
+
+    def reply_size(self, n: int, fast: bool = False) -> int:
+        """Bytes that ``n`` servos answer to that, without stuffing."""
+        return 8 + n * FAST_ITEM.itemsize if fast else n * STATUS.itemsize
+
+    def pack_enable(self, state: MotorState) -> bytes:
+        """Reset and start every watchdog, set the goal to where each servo stands with a gain of 0, torque on."""
+        n = len(self.ids)
+        here = np.nan_to_num(state.position)
+        hold = self.pack_command(MotorCommand(here, np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)))
+        return (
+            self.pack_write("BUS_WATCHDOG", [0] * n)
+            + self.pack_write("BUS_WATCHDOG", [watchdog_ticks(self._spec.watchdog)] * n)
+            + hold
+            + self.pack_write("TORQUE_ENABLE", [1] * n)
+        )
+
+    def pack_disable(self) -> bytes:
+        return self.pack_write("TORQUE_ENABLE", [0] * len(self.ids))
+
+    def pack_recover(self, state: MotorState) -> bytes:
+        """What a poll does besides asking: a watchdog that tripped and whose servo is off is started again, for what it
+        complains of is over once it is polled."""
+        rows = np.flatnonzero((state.error & TRIPPED != 0) & ~state.enabled)
+        if not len(rows):
+            return b""
+        zero, ticks = [0] * len(rows), [watchdog_ticks(self._spec.watchdog)] * len(rows)
+        off = self.pack_write("TORQUE_ENABLE", zero, rows)  # it holds its position until then
+        return off + self.pack_write("BUS_WATCHDOG", zero, rows) + self.pack_write("BUS_WATCHDOG", ticks, rows)
+
+    def pack_reboot(self, row: int) -> bytes:
+        """Clears a hardware error; takes about 0.3 s, and the RAM half of the control table is gone."""
+        return pack(int(self.ids[row]), Instruction.REBOOT)
+
+    def pack_read(self, register: str, rows: np.ndarray) -> bytes:
+        """Ask the servos ``rows`` for a register."""
+        r = REGISTERS[register]
+        return pack_sync_read(self.ids[rows].tobytes(), r.address, r.size)
+
+    def pack_write(self, register: str, values: Sequence[int], rows: np.ndarray | None = None) -> bytes:
+        """Write ``values`` to a register of the servos ``rows`` (None: all). Nobody answers."""
+        r = REGISTERS[register]
+        ids = self.ids if rows is None else self.ids[rows]
+        mask = (1 << 8 * r.size) - 1
+        items = [bytes([i]) + (v & mask).to_bytes(r.size, "little") for i, v in zip(ids.tolist(), values, strict=True)]
+        return pack_sync_write(r.address, b"".join(items), r.size)
+
+    def _sealed(self, packet: np.ndarray) -> bytes:
+        raw = packet.tobytes()
+        if raw.find(STUFFED, 7) >= 0:
+            return pack(raw[4], raw[7], raw[8:])
+        return raw + crc16(packet).to_bytes(2, "little")
+
+    # -- from the servos ---------------------------------------------------------------------------------------------
+
+    def unpack(self, data: bytes, state: MotorState, now: float) -> int:
+        """Put the states among ``data`` into ``state``; an incomplete packet waits for the next call. Returns how many
+        servos answered; ``rejected`` counts what was no good."""
+        if self._parser.pending or len(data) % STATUS.itemsize or not self._unpack_regular(data, state, now):
+            return self._unpack_any(data, state, now)
+        return len(data) // STATUS.itemsize
+
+    def _unpack_regular(self, data: bytes, state: MotorState, now: float) -> bool:
+        """The same if ``data`` are undamaged states without stuffing, as nearly always; else do nothing."""
+        status = np.frombuffer(data, STATUS)
+        head = status["head"]
+        if (head & ~np.uint64(_ID_MASK) != _STATUS_HEAD).any():
+            return False
+        rows = self._row_of[(head >> np.uint64(32) & np.uint64(0xFF)).astype(np.intp)]
+        if (rows < 0).any():
+            return False
+        raw = status.view(np.uint8).reshape(len(status), -1)
+        if (crc16_rows(raw[:, :-2]) != status["crc"]).any():
+            return False
+        self._store(rows, status["state"], state, now)
+        return True
+
+    def _unpack_any(self, data: bytes, state: MotorState, now: float) -> int:
+        bad, found, items = self._parser.rejected, [], []
+        for p in self._parser.feed(data):
+            if p.instruction != Instruction.STATUS:
+                continue  # an adapter's echo of what was sent
+            if p.id == BROADCAST:
+                rows, blocks = self._split_fast(p.parameters)
+                found += rows
+                items += blocks
+            elif (row := int(self._row_of[p.id])) >= 0 and len(p.parameters) == STATE_SIZE + 1:
+                found.append(row)
+                items.append(p.parameters[1:])
+            else:
+                self.rejected += 1
+        self.rejected += self._parser.rejected - bad
+        if found:
+            self._store(np.array(found), np.frombuffer(b"".join(items), STATE_ITEM), state, now)
+        return len(found)
+
+    def _split_fast(self, parameters: bytes) -> tuple[list[int], list[bytes]]:
+        """Rows and states in a whole fast answer: [error, id, state, CRC] of each servo, the last CRC being the packet's.
+        Whether servos stuff inside is not documented: a length as if not is taken as not."""
+        size, n = FAST_ITEM.itemsize, len(self._fast_rows)
+        if len(parameters) != n * size - 2:
+            parameters = unstuff(parameters)
+        if not n or len(parameters) != n * size - 2:
+            self.rejected += 1
+            return [], []
+        items = np.frombuffer(parameters + b"\0\0", FAST_ITEM)
+        rows = self._row_of[items["id"]]
+        if not np.array_equal(rows, self._fast_rows):
+            self.rejected += 1
+            return [], []
+        return rows.tolist(), [items["state"].tobytes()]
+
+    def _split_fast_prefix(self, raw: bytes) -> tuple[list[int], list[bytes]]:
+        """The same of one that broke off because a servo in the middle is silent: those whose running CRC is right."""
+        size, rows, blocks = FAST_ITEM.itemsize, [], []
+        for k, row in enumerate(self._fast_rows.tolist()):
+            end = 8 + (k + 1) * size
+            item = raw[end - size : end]
+            if len(raw) < end or item[1] != self.ids[row] or crc16(raw[: end - 2]) != item[-2] | item[-1] << 8:
+                break
+            rows.append(row)
+            blocks.append(item[2:-2])
+        return rows, blocks
+
+    def _store(self, rows: np.ndarray, item: np.ndarray, state: MotorState, now: float) -> None:
+        tripped = item["watchdog"] == WATCHDOG_TRIPPED
+        state.position[rows] = (item["position"] - float(ZERO)) * TICK
+        state.velocity[rows] = item["velocity"] * VELOCITY_UNIT
+        state.torque[rows] = item["current"] * self._torque[rows]
+        state.temperature[rows] = item["temperature"]
+        state.error[rows] = item["error"] + TRIPPED * tripped
+        state.enabled[rows] = (item["torque_enable"] == 1) & ~tripped
+        state.time[rows] = now
+
+    def unpack_register(self, register: str, data: bytes) -> list[tuple[int, int]]:
+        """Answers (row, value) to ``pack_read`` of that register among ``data``."""
+        r = REGISTERS[register]
+        answers = []
+        for p in self._parser.feed(data):
+            row = int(self._row_of[p.id])
+            if p.instruction == Instruction.STATUS and row >= 0 and len(p.parameters) == r.size + 1:
+                answers.append((row, int.from_bytes(p.parameters[1:], "little", signed=r.low < 0)))
+        return answers
+
+    def finish(self, state: MotorState, now: float) -> int:
+        """No more answers will come to the last request: take from a fast one that broke off what it says, and forget
+        the rest. ``now``: when the last bytes came. Returns how many servos answered."""
+        rows, items = self._split_fast_prefix(self._parser.pending)
+        self._parser.clear()
+        if rows:
+            self._store(np.array(rows), np.frombuffer(b"".join(items), STATE_ITEM), state, now)
+        return len(rows)
+
+    def configure(self, values: dict[str, list[int]]) -> None:
+        """Take over what the servos' registers said while connecting: goals outside their position limits would be
+        ignored without a word, so they saturate here."""
+        extended = np.array(values["OPERATING_MODE"]) == 4
+        self._low = np.where(extended, -EXTENDED_MAX, values["POSITION_MIN"]).astype(float)
+        self._high = np.where(extended, EXTENDED_MAX, values["POSITION_MAX"]).astype(float)
+
+    def error_name(self, code: int) -> str:
+        names = [name for bit, name in HARDWARE_ERRORS.items() if code & bit]
+        rest = code & ~sum(HARDWARE_ERRORS)
+        return ", ".join(names + [f"unknown error {rest:#x}"] * bool(rest)) or "none"
+
+
+def models_of(spec: BusSpec) -> list[Model]:
+    """Rows of MODELS of a bus. Raises BusError for a model that is not there."""
+    for m in spec.motors:
+        if m.model not in MODELS:
+            close = difflib.get_close_matches(m.model, MODELS, n=1)
+            hint = f" (did you mean '{close[0]}'?)" if close else ""
+            raise BusError(
+                f"bus {spec.name}, motor of {m.joint} (id {m.id}): no Dynamixel model '{m.model}'{hint}; known: "
+                f"{', '.join(MODELS)}.\n  Add its row to MODELS in drivers/codecs/dynamixel.py"
+            )
+    return [MODELS[m.model] for m in spec.motors]
+
+
+def _ids_of(spec: BusSpec) -> np.ndarray:
+    taken: dict[int, str] = {}
+    for m in spec.motors:
+        where = f"bus {spec.name}, motor of {m.joint}: got id {m.id}"
+        if not 0 <= m.id <= ID_MAX:
+            raise BusError(f"{where}, expected 0 to {ID_MAX}")
+        if m.id in taken:
+            raise BusError(f"{where}, which the motor of {taken[m.id]} has too: give it one of its own")
+        taken[m.id] = m.joint
+    return np.array(list(taken), np.uint8)
+
+
+def _checks(spec: BusSpec, models: list[Model]) -> list[RegisterCheck]:
+    """What connecting reads, writes and compares, in this order."""
+    baud = [code for code, rate in BAUD_RATES.items() if rate == spec.bitrate]
+    if not baud:
+        rates = ", ".join(map(str, BAUD_RATES.values()))
+        raise BusError(f"bus {spec.name}: got {spec.bitrate} bit/s, expected a rate that servos have: {rates}")
+    if spec.watchdog < WATCHDOG_UNIT:
+        raise BusError(f"bus {spec.name}: got a watchdog of {spec.watchdog:g} s, expected at least {WATCHDOG_UNIT:g} s")
+    numbers, ticks = [m.number for m in models], watchdog_ticks(spec.watchdog)
+    wizard = "set it with DYNAMIXEL Wizard while torque is off"
+    return [
+        RegisterCheck(
+            "TORQUE_ENABLE", 0, 0, "does another program command it? Stop that, and connect again", write=True
+        ),
+        RegisterCheck("STATUS_RETURN_LEVEL", 2, 2, "the servo would not answer reads", write=True),
+        RegisterCheck("MODEL", numbers, numbers, "put the servo's model into the wiring"),
+        RegisterCheck("FIRMWARE", FIRMWARE_MIN, 255, "no bus watchdog: update the firmware"),
+        RegisterCheck("BAUD", baud[0], baud[0], f"the bus runs at {spec.bitrate} bit/s: {wizard}"),
+        RegisterCheck("RETURN_DELAY", 0, 0, f"each answer would come units of 2 us late: {wizard}"),
+        RegisterCheck("DRIVE_MODE", 0, 0, f"reversed or time-based profiles would falsify targets: {wizard}"),
+        RegisterCheck("OPERATING_MODE", 3, 4, f"position (3) or extended position (4): {wizard}"),
+        RegisterCheck("POSITION_MIN", 0, TICKS - 1, "outside a turn"),
+        RegisterCheck("POSITION_MAX", 0, TICKS - 1, "outside a turn"),
+        RegisterCheck(
+            "INDIRECT", INDIRECT_VALUE, INDIRECT_VALUE, "no indirect addressing: update the firmware", write=True
+        ),
+        RegisterCheck("PROFILE_ACCELERATION", 0, 0, "targets would be smoothed", write=True),
+        RegisterCheck("PROFILE_VELOCITY", 0, 0, "targets would be smoothed", write=True),
+        RegisterCheck("POSITION_D_GAIN", 0, 0, "see the docstring of drivers/codecs/dynamixel.py", write=True),
+        RegisterCheck("POSITION_I_GAIN", 0, 0, "targets would be overshot", write=True),
+        RegisterCheck("BUS_WATCHDOG", ticks, ticks, "the servo would not stop by itself", write=True),
+    ]
