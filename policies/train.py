@@ -68,14 +68,14 @@ class Training:
                 if score >= self.best:
                     self.best = score
                     self._save("best.pt")
-            if self.iteration % self.config.save_every == 0:
-                if self.rank == 0:
-                    self._save("last.pt")
-                self.env.reset()  # what a resumed run does too, so both continue alike
             if self.rank == 0:
                 with (self.folder / "curve.jsonl").open("a") as file:
                     file.write(json.dumps(row) + "\n")
                 report(row)
+            if self.iteration % self.config.save_every == 0 or self.samples >= self.config.samples:
+                if self.rank == 0:
+                    self._save("last.pt")
+                self.env.reset()  # what a resumed run does too, so both continue alike
 
     def step(self) -> dict[str, float]:
         """One iteration: collect ``horizon`` ticks, update. Returns a row of the curve."""
@@ -122,6 +122,10 @@ class Training:
         self.iteration, self.best = state["iteration"], state["best"]
         self.env.load_state_dict(state["env"])
         torch.set_rng_state(state["torch_rng"])
+        if self.rank == 0:  # what came after the checkpoint never happened
+            curve = self.folder / "curve.jsonl"
+            lines = curve.read_text().splitlines(keepends=True) if curve.is_file() else []
+            curve.write_text("".join(x for x in lines if json.loads(x)["iteration"] <= self.iteration))
         return True
 
     def _save(self, name: str) -> None:
@@ -242,5 +246,5 @@ def train_command(folder: Path, **settings: float) -> None:
 
         training.run(report)
     console.print(
-        f"best: {training.best:.1%} mean survival, {folder / 'best.pt'}; next: sim2real eval --folder {folder}"
+        f"best: {training.best:.1%} mean survival, {folder / 'best.pt'}; next: sim2real train g1-basics --folder {folder} --export FILE.onnx"
     )

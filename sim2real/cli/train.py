@@ -28,12 +28,22 @@ class Args:
     """threads of the physics"""
     seed: int | None = None
     """of everything random"""
+    export: Path | None = None
+    """train no further: write the best checkpoint so far to this policy file (.onnx)"""
 
 
 def main(argv: list[str]) -> int:
     args = tyro.cli(Args, args=argv, prog="sim2real train")
+    folder = args.folder or Path("runs") / args.task
+    if args.export:
+        policy = training_side("policies.release").release(folder, args.export)
+        print(
+            f"{args.export}: {', '.join(policy.contract.skill_labels)}; golden error {policy.golden_error:.1e}\n"
+            f"  sha256 {policy.sha256}\n  next: sim2real eval {args.export}"
+        )
+        return 0
     training_side("policies.train").train_command(
-        folder=args.folder or Path("runs") / args.task,
+        folder=folder,
         **{k: getattr(args, k) for k in ("samples", "envs", "threads", "seed") if getattr(args, k) is not None},
     )
     return 0

@@ -32,6 +32,7 @@ def test_a_resumed_run_continues_exactly(tmp_path):
         half.step()
     half.folder.mkdir()
     half._save("last.pt")
+    (half.folder / "curve.jsonl").write_text('{"iteration": 1}\n{"iteration": 2}\n{"iteration": 3}\n')
     rest = Training(TINY, tmp_path / "split")
     assert rest.resume() and rest.iteration == 2
     rest.run()
@@ -39,6 +40,8 @@ def test_a_resumed_run_continues_exactly(tmp_path):
     for name, value in parameters(whole).items():
         assert torch.equal(value, parameters(rest)[name]), name
     assert whole.env.state_dict() == rest.env.state_dict()
+    curve = [json.loads(line)["iteration"] for line in (tmp_path / "split" / "curve.jsonl").read_text().splitlines()]
+    assert curve == [1, 2, 3, 4]  # the 3 that was never checkpointed is gone
 
 
 def test_a_run_leaves_its_config_and_curve(tmp_path):
