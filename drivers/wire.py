@@ -61,6 +61,24 @@ class SerialWire(Protocol):
     def close(self) -> None: ...
 
 
+class DdsWire(Protocol):
+    """A DDS domain: samples on named topics, each with its CDR payload, header included."""
+
+    def write(self, topic: str, payload: bytes) -> None:
+        """Publish one sample. Never blocks. Raises WireError."""
+        ...
+
+    def read(self, topic: str) -> list[bytes]:
+        """The payloads that arrived since the last call, oldest first. Never blocks."""
+        ...
+
+    def writers(self, topic: str) -> int:
+        """How many others publish on ``topic``."""
+        ...
+
+    def close(self) -> None: ...
+
+
 def make_frames(ids: np.ndarray, data: np.ndarray, length: int = 8) -> np.ndarray:
     """Frames from ``ids`` (n,) uint32 and ``data`` (n, 8) uint8."""
     frames = np.zeros(len(ids), FRAME)
