@@ -19,7 +19,7 @@ from policies.train import git_revision, load_graph
 from sim2real.config import load_robot
 from sim2real.policy import Policy
 
-GOLDEN_STEPS = 60  # policy ticks of each golden sequence, with two skill switches
+GOLDEN_STEPS = 40  # policy ticks of each golden sequence, with two skill switches
 SETTLED = 100  # ticks after which an undisturbed episode counts as healthy
 
 
