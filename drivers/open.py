@@ -21,10 +21,16 @@ class BusProtocol(NamedTuple):
     motors: str = ""
 
 
+def _can(name: str, codec: str) -> BusProtocol:
+    """A protocol on CanBus: its codec, and in drivers/sim its motors, are files of its ``name``."""
+    return BusProtocol(
+        "can", "drivers.can_bus:CanBus", f"drivers.codecs.{name}:{codec}Codec", f"drivers.sim.{name}:Sim{codec}"
+    )
+
+
 PROTOCOLS: dict[str, BusProtocol] = {
-    "damiao": BusProtocol(
-        "can", "drivers.can_bus:CanBus", "drivers.codecs.damiao:DamiaoCodec", "drivers.sim.damiao:SimDamiao"
-    ),
+    "damiao": _can("damiao", "Damiao"),
+    "robstride": _can("robstride", "Robstride"),
 }
 
 IMUS: dict[str, str] = {

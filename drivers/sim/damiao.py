@@ -39,6 +39,9 @@ class SimDamiao(SimMotors):
         ranges = damiao.ranges_of(self.specs)
         return [_factory_registers(m, ranges, i) for i, m in enumerate(self.specs)]
 
+    def addressee(self, bus: int, id: int, raw: bytes) -> int:
+        return self._rows[bus].get(raw[8] | raw[9] << 8 if id == damiao.BROADCAST_ID else id, -1)
+
     def receive(self, bus: int, id: int, raw: bytes, time: float) -> Answer | None:
         row = self._rows[bus].get(id)
         if row is None or raw[8:15] == MAGIC_PREFIX or raw[4] != 8:
@@ -101,7 +104,7 @@ class SimDamiao(SimMotors):
             np.array([self.specs[row].feedback_id], np.uint32),
             damiao.pack_register(self.specs[row].id, request.operation, request.register, value)[None],
         )
-        return row, self._keys[row], frame.tobytes(), int(self._frame_bits(frame)[0])
+        return self._say(row, frame)
 
     def _pack_feedback(self) -> np.ndarray:
         return self._codec.pack_feedback(

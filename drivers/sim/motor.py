@@ -22,6 +22,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from drivers.bus import BusError, BusSpec, MotorCommand
+from drivers.sim.wire import priority
 from drivers.wire import FRAME
 
 # A plain two-node thermal model; its constants are of the right size for a motor of this class, not measured.
@@ -140,6 +141,10 @@ class SimMotors:
         """What the registers of each motor hold when it leaves the factory."""
         raise NotImplementedError
 
+    def addressee(self, bus: int, id: int, raw: bytes) -> int:
+        """Row of the motor that a frame of the host is for; -1: none."""
+        return self._rows[bus].get(id, -1)
+
     def receive(self, bus: int, id: int, raw: bytes, time: float) -> Answer | None:
         """A frame that ended at ``time`` on a bus: the answer (row, arbitration key, raw frame, bits), or None."""
         raise NotImplementedError
@@ -179,6 +184,10 @@ class SimMotors:
         if self._stale:
             self.refresh()
         return row, self._keys[row], self._feedback[16 * row : 16 * row + 16], self._bits[row]
+
+    def _say(self, row: int, frame: np.ndarray) -> Answer:
+        """Any other answer (FRAME, (1,)) of one motor."""
+        return row, priority(int(frame["id"][0])), frame.tobytes(), int(self._frame_bits(frame)[0])
 
     def refresh(self, raw: bytes = b"") -> list[int]:
         """Bits of the host's frames ``raw``, and, in the same pass, every motor's feedback of this substep."""

@@ -29,7 +29,6 @@ BUS_OFF_COUNT = 256  # ISO 11898-1: transmit error counter at which a controller
 BUS_OFF_TRIES = BUS_OFF_COUNT // 8  # failures in a row that take it there; a motor's answer is lost then
 RESTART = 0.1  # s: how long the host then stays away (restart-ms 100, the usual setting)
 QUEUE_LENGTH = 128  # frames; Linux' default of 10 is too small for a tick (set txqueuelen 128)
-BROADCAST_ID = 0x7FF
 TOLERANCE = 1e-9  # s: what sums of times may be off by
 
 
@@ -37,6 +36,10 @@ class Motors(Protocol):
     """What a wire asks of the motors on it. ``row``: a motor's index over all buses."""
 
     powered: list[bool]
+
+    def addressee(self, bus: int, id: int, raw: bytes) -> int:
+        """Row of the motor that a frame of the host is for; -1: none."""
+        ...
 
     def receive(self, bus: int, id: int, raw: bytes, time: float) -> tuple[int, int, bytes, int] | None:
         """A frame that ended at ``time``: the answer (row, key, raw frame, bits), or None."""
@@ -254,7 +257,7 @@ class SimCan:
     def _spoil_command(self, faults, start, id, raw, bits, tries) -> int | None:
         """How often the host's frame is heard; None: it was not carried (broken off, or held back)."""
         copies = 1
-        row = self.rows.get(raw[8] | raw[9] << 8 if id == BROADCAST_ID else id, -1)
+        row = self._motors.addressee(self.index, id, raw)
         for fault in self._hits(faults, start, row):
             if fault.kind == "drop":
                 copies = 0
