@@ -17,14 +17,19 @@ from policies.clips import kinematics
 from policies.clips.format import Clip
 from policies.clips.kinematics import smooth, smooth_orientation
 from policies.clips.robot import POINT_NAMES, SIDES, RobotBody
-from policies.clips.targets import Targets, targets
+from policies.clips.targets import Targets, pulled_in, targets
 
 FPS = 50.0  # of policies
 SOLVER = "daqp"
-FIRST_STEPS, STEPS, POLISH_STEPS = 60, 4, 4  # inverse kinematics steps for the first frame, every further one, and in pass 2
+FIRST_STEPS, STEPS, POLISH_STEPS = (
+    60,
+    4,
+    4,
+)  # inverse kinematics steps for the first frame, every further one, and in pass 2
 DAMPING = 1e-3
 MARGIN = 0.02  # rad inside the joint limits, as the safety gate demands by default
 SMOOTHING = 1.5  # frames, between the passes
+CLEARANCE = 0.005  # m between arms and everything else of the robot
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,13 @@ class Imitator:
         self.configuration = mink.Configuration(model)
         self.dt = 1.0 / fps / steps
         velocities = dict(zip(body.robot.joint_names, body.robot.velocity_max, strict=True))
-        self.limits = [mink.ConfigurationLimit(model), mink.VelocityLimit(model, velocities)]
+        apart = mink.CollisionAvoidanceLimit(
+            model,
+            self._arms_and_the_rest(),
+            minimum_distance_from_collisions=CLEARANCE,
+            collision_detection_distance=0.05,
+        )
+        self.limits = [mink.ConfigurationLimit(model), apart, mink.VelocityLimit(model, velocities)]
         bodies = {part: model.body(model.jnt_bodyid[i]).name for part, i in body.joint_ids.items()}
         self.base = mink.FrameTask(body.robot.base, "body", 1.0, 1.0)
         self.trunk = mink.FrameTask(body.trunk, "body", 0.0, 1.0)
@@ -80,6 +91,16 @@ class Imitator:
             *(self.base, self.trunk, self.balance, self.posture),
             *(self.knees + self.feet + self.elbows + self.palms),
         ]
+
+    def _arms_and_the_rest(self) -> list[tuple[list[int], list[int]]]:
+        """Pairs to keep apart: what moves with an elbow, and every other colliding geom of the robot."""
+        model = self.model
+        solid = np.flatnonzero((model.geom_contype | model.geom_conaffinity) & (model.geom_bodyid != 0))
+        elbows = [model.jnt_bodyid[self.body.joint_ids[f"{side}_elbow"]] for side in SIDES]
+        arms = [[g for g in solid.tolist() if _carries(model, elbow, model.geom_bodyid[g])] for elbow in elbows]
+        shoulders = [model.jnt_bodyid[self.model.joint(self.body.limbs[f"{s}_shoulder"][0]).id] for s in SIDES]
+        rest = [g for g in solid.tolist() if not any(_carries(model, s, model.geom_bodyid[g]) for s in shoulders)]
+        return [(arms[0], rest), (arms[1], rest), (arms[0], arms[1])]
 
     def _finger_axis(self, k: int) -> np.ndarray:
         """Where fingers would point, in the palm's frame: away from the elbow at rest."""
@@ -155,11 +176,20 @@ class Imitator:
             for _ in range(POLISH_STEPS):
                 self.reach(goal, t, POLISH)
                 v = mink.solve_ik(
-                    self.configuration, self.tasks, self.dt, SOLVER, damping=DAMPING, limits=self.limits[:1]
+                    self.configuration, self.tasks, self.dt, SOLVER, damping=DAMPING, limits=self.limits[:2]
                 )
                 self.configuration.integrate_inplace(v, self.dt)
             solved.append(self.configuration.q.copy())
         return np.stack(solved)
+
+    def shoulders(self, path: np.ndarray) -> np.ndarray:
+        """(T, 2, 3) m in the world, for configurations (T, nq)."""
+        joints = [self.body.joint_ids[f"{side}_shoulder"] for side in SIDES]
+        found = []
+        for q in path:
+            self.configuration.update(q)
+            found.append(self.configuration.data.xanchor[joints].copy())
+        return np.stack(found)
 
 
 def retarget(clip: Clip, body: RobotBody, fps: float = FPS, ball_radius: float = RADIUS) -> tuple[Clip, Targets]:
@@ -167,8 +197,13 @@ def retarget(clip: Clip, body: RobotBody, fps: float = FPS, ball_radius: float =
     body = _within_limits(body)
     goal = targets(clip, body, fps, ball_radius, hand_radius(body))
     imitator = Imitator(body, fps, STEPS)
-    path = _smoothed(imitator.follow(goal), SMOOTHING)
-    path = imitator.polish(goal, path)
+    path = imitator.follow(goal)
+    reachable = pulled_in(
+        goal, imitator.shoulders(path), body.length("shoulder", "elbow") + body.length("elbow", "palm")
+    )
+    if reachable is not goal:
+        goal, path = reachable, imitator.follow(reachable)
+    path = imitator.polish(goal, _smoothed(path, SMOOTHING))
     return _clip(clip, body, goal, path), goal
 
 
@@ -180,9 +215,7 @@ def hand_radius(body: RobotBody) -> float:
 def _within_limits(body: RobotBody) -> RobotBody:
     """The same body, with joint ranges ``MARGIN`` narrower: where a policy may send it."""
     model = mujoco.MjModel.from_xml_path(str(body.robot.model_path))
-    for name, low, high in zip(
-        body.robot.joint_names, body.robot.position_min, body.robot.position_max, strict=True
-    ):
+    for name, low, high in zip(body.robot.joint_names, body.robot.position_min, body.robot.position_max, strict=True):
         model.joint(name).range = low + MARGIN, high - MARGIN
     return RobotBody(body.robot, model, body.trunk, body.limbs)
 
@@ -220,6 +253,13 @@ def _clip(clip: Clip, body: RobotBody, goal: Targets, path: np.ndarray) -> Clip:
         ball_velocity_in_world=goal.ball_velocity,
         contact=np.concatenate([goal.touching, goal.stance], axis=1),
     )
+
+
+def _carries(model: mujoco.MjModel, ancestor: int, body: int) -> bool:
+    """Whether ``body`` hangs on ``ancestor``."""
+    while body != ancestor and body:
+        body = model.body_parentid[body]
+    return body == ancestor
 
 
 def _pose(position: np.ndarray, rotation: np.ndarray) -> mink.SE3:

@@ -79,7 +79,7 @@ BALL_RADIUS = 0.12
 # Share of the body's mass and where it sits on a segment (0 the first body, 1 the second).
 # P. de Leva, Adjustments to Zatsiorsky-Seluyanov's segment inertia parameters, J. Biomechanics 29 (1996), table 4, men.
 SEGMENTS: tuple[tuple[str, str, float, float], ...] = (
-    ("Pelvis", "Neck", 0.435, 0.55),
+    ("Pelvis", "Neck", 0.435, 0.42),
     ("Neck", "Head", 0.069, 1.0),
     *((f"{s}_Hip", f"{s}_Knee", 0.142, 0.41) for s in "LR"),
     *((f"{s}_Knee", f"{s}_Ankle", 0.043, 0.45) for s in "LR"),

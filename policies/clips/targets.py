@@ -9,7 +9,7 @@ A hand on or near the ball is placed relative to the ball, a far one relative to
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,10 +23,13 @@ from policies.clips.skeleton import INDEX
 
 BODY_SMOOTHING = 1.0  # frames of the recording: fingers and wrists jump
 NEAR, FAR = 0.22, 0.45  # m from hand to ball centre in the recording: placed by the ball, by the shoulder
-OPPOSED = 0.75  # 0: both hands touch where the person's do; 1: exactly opposite. A hand without fingers holds by friction
+OPPOSED = (
+    0.75  # 0: both hands touch where the person's do; 1: exactly opposite. A hand without fingers holds by friction
+)
 KNUCKLES = ("Index1", "Middle1", "Pinky1", "Ring1")
 PELVIS_SHARE = 0.15  # in a foot's left axis
 STRETCHED = 0.98  # of its length, a leg reaches at most
+ARM_STRETCHED = 0.95  # of its length, from shoulder to palm, while the palm is on the ball
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ def targets(clip: Clip, body: RobotBody, fps: float, ball_radius: float, hand_ra
         fps=fps,
         length_scale=s,
         ball=ball,
-        ball_velocity=clip.ball_velocity_in_world * np.sqrt(s),
+        ball_velocity=s * clip.ball_velocity_in_world,
         ball_radius=ball_radius,
         base=base,
         base_frame=base_frame,
@@ -158,9 +161,7 @@ def _lowest(at: np.ndarray, frames: np.ndarray, name: str, body: RobotBody) -> n
     return (at[:, None, 2] + np.einsum("tij,cj->tci", frames, corners)[..., 2] - radius).min(axis=1)
 
 
-def _planted(
-    ankle: np.ndarray, frames: np.ndarray, stance: np.ndarray, height: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _planted(ankle: np.ndarray, frames: np.ndarray, stance: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
     """Ankles (T, 3) and feet's frames (T, 3, 3) with every stance at one place, level, the ankle ``height`` m up, and the
     steps between two stances drawn along."""
     yaw = np.unwrap(np.arctan2(frames[:, 1, 0], frames[:, 0, 0]))
@@ -223,9 +224,7 @@ def _palms(clip: Clip, s: float, ball: np.ndarray, touch: float) -> tuple[np.nda
     if not clip.header.has_ball:
         return np.zeros((len(clip), 2, 3)), np.zeros((len(clip), 2))
     points = clip.points_in_world
-    centre = np.stack(
-        [np.mean([points[:, INDEX[f"{side}_{p}"]] for p in KNUCKLES], axis=0) for side in "LR"], axis=1
-    )
+    centre = np.stack([np.mean([points[:, INDEX[f"{side}_{p}"]] for p in KNUCKLES], axis=0) for side in "LR"], axis=1)
     to_hand = centre - clip.ball_position_in_world[:, None]
     distance = hand_distance(points, clip.ball_position_in_world)
     contact = clip.contact[:, :2]
@@ -238,3 +237,33 @@ def _palms(clip: Clip, s: float, ball: np.ndarray, touch: float) -> tuple[np.nda
     both = (by_ball[:, 0] * by_ball[:, 1])[:, None, None]
     towards = unit(towards - OPPOSED * both * towards.mean(axis=1, keepdims=True))
     return ball[:, None] + towards * (touch + away)[..., None], np.clip(by_ball, 0.0, 1.0)
+
+
+def pulled_in(goal: Targets, shoulders: np.ndarray, arm_length: float) -> Targets:
+    """``goal`` with the ball where the arms reach it, given ``shoulders`` (T, 2, 3) m.
+
+    While a hand is on the ball, ball and palms are drawn towards shoulders that are further away than ``arm_length`` m.
+    A flight before or after is moved as a whole; one between two contacts is sheared evenly, which leaves its
+    acceleration alone, and one that ends on the floor keeps its height there.
+    """
+    way = shoulders - goal.palms
+    far = np.linalg.norm(way, axis=-1, keepdims=True)
+    excess = np.maximum(far - ARM_STRETCHED * arm_length, 0.0) * goal.touching[..., None]
+    if excess.max(initial=0.0) < 1e-3:
+        return goal
+    pull = (excess * way / np.maximum(far, 1e-9)).sum(axis=1) / np.maximum(goal.touching.sum(axis=1), 1)[:, None]
+    held = goal.touching.any(axis=1)
+    offset = np.zeros_like(pull)
+    for start, stop in spans(held):
+        offset[start:stop] = smooth(pull[start:stop], 3.0)
+    frames, contacts = np.arange(len(held)), np.flatnonzero(held)
+    shift = np.stack([np.interp(frames, contacts, offset[contacts, axis]) for axis in range(3)], axis=1)
+    low = np.flatnonzero((goal.ball[:, 2] < goal.ball_radius + 0.03) & ~held)
+    knots = np.union1d(contacts, low)
+    shift[:, 2] = np.interp(frames, knots, np.where(np.isin(knots, contacts), offset[knots, 2], 0.0))
+    return replace(
+        goal,
+        ball=goal.ball + shift,
+        ball_velocity=goal.ball_velocity + kinematics.rate(shift, goal.fps),
+        palms=goal.palms + shift[:, None],
+    )
