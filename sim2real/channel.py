@@ -63,7 +63,7 @@ class Channel:
         slot = following & 1
         data = record.view(np.uint8)
         self._slots[slot][:] = data
-        self._sums[slot][0] = zlib.crc32(data)
+        self._sums[slot][0] = zlib.crc32(data.data)
         self._sequence[0] = following
 
     def read(self) -> bool:
@@ -74,7 +74,7 @@ class Channel:
                 return False
             slot = sequence & 1
             self._scratch[:] = self._slots[slot]
-            if zlib.crc32(self._scratch) == int(self._sums[slot][0]):
+            if zlib.crc32(self._scratch.data) == int(self._sums[slot][0]):
                 self._bytes[:] = self._scratch
                 self._seen = sequence
                 return True
@@ -82,8 +82,7 @@ class Channel:
 
     def close(self) -> None:
         """Let go of the file. The channel must not be used afterwards."""
-        self._sequence = None
-        self._sums = self._slots = []
+        del self._sequence, self._sums, self._slots  # they look into the buffer
         if isinstance(self._buffer, mmap.mmap):
             self._buffer.close()
         if self._file is not None:

@@ -52,14 +52,14 @@ class Child:
             env={**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
         )
         assert self.process.stdin and self.process.stdout
-        os.set_blocking(self.process.stdout.fileno(), False)
+        self._stdout = self.process.stdout.fileno()
+        os.set_blocking(self._stdout, False)
         self._text = b""
 
     def messages(self) -> list[dict[str, Any]]:
         """What it said since the last call. Never blocks."""
-        assert self.process.stdout
         try:
-            while chunk := os.read(self.process.stdout.fileno(), 65536):
+            while chunk := os.read(self._stdout, 65536):
                 self._text += chunk
         except BlockingIOError:
             pass
@@ -71,7 +71,7 @@ class Child:
         clock, said = MonotonicClock(), []
         end = clock.now() + timeout
         while clock.now() < end:
-            select.select([self.process.stdout], [], [], 0.05)
+            select.select([self._stdout], [], [], 0.05)
             for message in self.messages():
                 if message.get("ready"):
                     return

@@ -6,9 +6,9 @@ into an MCAP file without being touched, and any ROS 2-aware viewer reads it by 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import IntFlag
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from sim2real.types import JointCommand, RobotState
 
 QUATERNION = ("w", "x", "y", "z")
 VECTOR = ("x", "y", "z")
+
+Field: TypeAlias = tuple[str, str, Sequence[str] | None]  # name, numpy type, names of its elements (None: a scalar)
 
 
 class Calls(IntFlag):
@@ -39,14 +41,14 @@ class Layout(NamedTuple):
         return np.zeros(1, self.dtype)
 
 
-def layout(name: str, fields: Sequence[tuple[str, str, Sequence[str] | None]]) -> Layout:
+def layout(name: str, fields: Sequence[Field]) -> Layout:
     """A Layout from (field, "f8" | "i8", names of its elements or None for a scalar)."""
     dtype = np.dtype([(f, t) if names is None else (f, t, (len(names),)) for f, t, names in fields])
     assert all(np.dtype(t).itemsize == 8 for _, t, _ in fields)
     return Layout(name, dtype, {f: tuple(names) for f, _, names in fields if names is not None})
 
 
-def state_fields(joints: Sequence[str]) -> list[tuple[str, str, Sequence[str] | None]]:
+def state_fields(joints: Sequence[str]) -> list[Field]:
     """The fields of a ``types.RobotState``."""
     return [
         ("state.time", "f8", None),
@@ -64,11 +66,10 @@ def state_fields(joints: Sequence[str]) -> list[tuple[str, str, Sequence[str] | 
     ]
 
 
-def command_fields(prefix: str, joints: Sequence[str]) -> list[tuple[str, str, Sequence[str] | None]]:
+def command_fields(prefix: str, joints: Sequence[str]) -> list[Field]:
     """The fields of a ``types.JointCommand``, under ``prefix``."""
-    return [(f"{prefix}.time", "f8", None)] + [
-        (f"{prefix}.{f}", "f8", joints) for f in ("joint_pos", "joint_vel", "joint_torque", "kp", "kd")
-    ]
+    arrays = ("joint_pos", "joint_vel", "joint_torque", "kp", "kd")
+    return [(f"{prefix}.time", "f8", None), *((f"{prefix}.{name}", "f8", joints) for name in arrays)]
 
 
 def tick_layout(joints: Sequence[str], buses: Sequence[str]) -> Layout:
@@ -101,7 +102,7 @@ def tick_layout(joints: Sequence[str], buses: Sequence[str]) -> Layout:
     )
 
 
-def pilot_layout(joints: Sequence[str], inputs: dict[str, Sequence[str]], skills: Sequence[str]) -> Layout:
+def pilot_layout(joints: Sequence[str], inputs: Mapping[str, Sequence[str]], skills: Sequence[str]) -> Layout:
     """What the pilot fed its policy and what came out, each policy tick. ``inputs``: signal -> element names."""
     return layout(
         "Pilot",

@@ -3,6 +3,9 @@
 Needs an OpenGL that works without a screen: ``MUJOCO_GL=egl`` (libegl1, libgl1-mesa-dri) or ``osmesa`` (libosmesa6).
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco's compiled modules have no type stubs)
+
 from __future__ import annotations
 
 import os

@@ -28,6 +28,7 @@ _DRIVE = {
 class KeyboardOperator:
     """``speed``: velocity while a key is held (m/s, m/s, rad/s). Restores the terminal on ``close``."""
 
+    arm_time = 0.2  # s that one key press asks for: another press asks again
     hold_time = 0.75  # s after the last repeat of a driving key until the velocity is zero (faults.md row 20)
 
     def __init__(self, labels: Sequence[str], speed: tuple[float, float, float] = (0.5, 0.3, 0.6), stream=None):
@@ -43,26 +44,29 @@ class KeyboardOperator:
         self._skill: str | None = None
         self._velocity = (0.0, 0.0, 0.0)
         self._driven = -1e9
-        self._arm = self._stop = self._quit = False
+        self._armed = -1e9  # when it was last asked to arm
+        self._stop = self._quit = False
 
     def read(self, now: float, since: float) -> OperatorInput:
         for key in self._keys():
             self._press(key, now)
         if now - self._driven > self.hold_time:
             self._velocity = (0.0, 0.0, 0.0)
-        return OperatorInput(now, self._skill, self._velocity, self._arm, self._stop, self._quit)
+        arm = now - self._armed < self.arm_time
+        return OperatorInput(now, self._skill, self._velocity, arm, self._stop, self._quit)
 
     def _press(self, key: str, now: float) -> None:
         if key == "a":
-            self._arm, self._stop = True, False
+            self._armed, self._stop = now, False
         elif key == " ":
-            self._arm, self._stop = False, True
+            self._armed, self._stop = -1e9, True
         elif key in ("q", "\x03", "\x04"):
             self._quit = True
         elif key.isdigit() and 1 <= int(key) <= len(self._labels):
             self._skill = self._labels[int(key) - 1]
         elif key in _DRIVE:
-            self._velocity = tuple(d * s for d, s in zip(_DRIVE[key], self._speed, strict=True))
+            forward, left, turn = (d * s for d, s in zip(_DRIVE[key], self._speed, strict=True))
+            self._velocity = (forward, left, turn)
             self._driven = now
 
     def _keys(self) -> list[str]:
