@@ -175,7 +175,7 @@ def markdown() -> str:
     ]
     for r in RULES:
         reaction = "refuse" if r.when is ARM else "report" if r.reaction is RUN else r.reaction.name
-        bound = "-" if r.when is ARM else f"{1000 * r.bound:.0f} ms"
+        bound = "-" if r.when is ARM else f"{r.bound:g} s"
         lines.append(f"| {r.id} | `{r.name}` | {reaction} | {r.when.value} | {bound} | {r.description} | {r.source} |")
     lines += ["", "| id | limit | what is done to every command | source |", "|---|---|---|---|"]
     lines += [f"| {c.id} | `{c.name}` | {c.description} | {c.source} |" for c in CLAMPS]
