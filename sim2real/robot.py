@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from drivers.open import open_bus, open_imu
 
 from drivers.budget import check
 from drivers.bus import Clock, Imu, ImuState, MotorBus, MotorCommand, MotorState
+from drivers.open import open_bus, open_imu
 from sim2real.config import RobotConfig, Wiring
 from sim2real.types import JointCommand, RobotState
 

@@ -23,7 +23,6 @@ from sim2real.safety import Limits, Safety
 from sim2real.skills import Runnable, SkillPlayer, Stage
 from sim2real.summary import Measures, Summary
 
-
 SETTLE = 3.0  # s: a limp robot on its gantry swings for a while before anybody switches it on
 
 LOWERING = 0.55  # s at 0.1 m/s: feet touch, and the rope still carries about half of the weight

@@ -27,7 +27,8 @@ class ScriptOperator:
         self.duration = sum(s.duration for s in steps)
 
     def read(self, now: float, since: float) -> OperatorInput:
-        if since < 0:  # ask again and again until the gate agrees; once performing, never: a fault is a person's to clear
+        # Ask again and again until the gate agrees; once performing, never: a fault is a person's to clear.
+        if since < 0:
             return OperatorInput(now, self.steps[0].skill, arm=now % self.ask_every < self.ask_every / 2)
         for step in self.steps:
             if since < step.duration:
