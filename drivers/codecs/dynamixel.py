@@ -508,9 +508,10 @@ class DynamixelCodec:
     def unpack(self, data: bytes, state: MotorState, now: float) -> int:
         """Put the states among ``data`` into ``state``; an incomplete packet waits for the next call. Returns how many
         servos answered; ``rejected`` counts what was no good."""
-        if self._parser.pending or len(data) % STATUS.itemsize or not self._unpack_regular(data, state, now):
-            return self._unpack_any(data, state, now)
-        return len(data) // STATUS.itemsize
+        whole = data and not self._parser.pending and len(data) % STATUS.itemsize == 0
+        if whole and self._unpack_regular(data, state, now):
+            return len(data) // STATUS.itemsize
+        return self._unpack_any(data, state, now)
 
     def _unpack_regular(self, data: bytes, state: MotorState, now: float) -> bool:
         """The same if ``data`` are undamaged states without stuffing, as nearly always; else do nothing."""
