@@ -109,7 +109,7 @@ def test_the_command_is_on_the_path(installed, tmp_path):
 
 def test_deploy_runs_elsewhere_without_torch(installed, tmp_path):
     summary = tmp_path / "out.json"
-    argv = ["deploy", "--robot", "g1", "--clock", "lockstep", "--duration", "3", "--json", str(summary)]
+    argv = ["deploy", "--robot", "g1", "--clock", "lockstep", "--script", "stand:3", "--json", str(summary)]
     output = run([str(installed), "-c", REPORT_MODULES.format(argv=argv)], tmp_path)
     assert json.loads(summary.read_text())["fell"] is False
     assert {"mujoco", "onnxruntime"} <= top_level_modules(output), "the run was not a run"
