@@ -120,8 +120,9 @@ class Guardian:
         or an operator does."""
         clock = self.clock
         start = clock.now()
+        request = self._request()
         calls = self._obey_operator(start) | self._failed
-        command = self.safety.step(self._state, self._request(), start)
+        command = self.safety.step(self._state, request, start)
         judged = clock.now()
         self._transmit(command)
         self._report_fault()
@@ -158,7 +159,10 @@ class Guardian:
             calls |= Calls.STOP
         arm = bool(wish["arm"]) and self._ending is None and not wish["stop"]
         if arm and not self._arm_seen and self.safety.mode != Mode.RUN:
-            self._enabling = now
+            if now - self._wish.time < self.safety.limits.command_age_hold:
+                self._enabling = now
+            else:
+                self.tell("not armed: the pilot sends no commands; see its messages, then arm again")
         self._arm_seen = arm
         if self._enabling is not None and self._arm(now):
             calls |= Calls.ARM
@@ -270,7 +274,6 @@ def main(directory: Path) -> int:
         sink(spec),
         tell,
     )
-    tell("ready", ready=True)
 
     def goes_on() -> bool:
         if not life.goes_on():

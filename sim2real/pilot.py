@@ -122,7 +122,6 @@ def main(directory: Path) -> int:
         channel(directory, "pilot", layout_of(player)),
         sink(spec),
     )
-    tell("ready", ready=True)
     refused = 0
 
     def tick(scheduled: float, lateness: float, late: int) -> None:

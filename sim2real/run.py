@@ -106,6 +106,10 @@ def keep_time(
         tell(f"tuned: {granted}", tuning=str(granted))
     schedule = Schedule(clock, period)
     schedule.start(at=(int(clock.now() / period) + 2) * period + phase)
+    ready = False
     while goes_on():
         due = schedule.wait()
         tick(due, schedule.lateness, schedule.late)
+        if not ready:
+            ready = True
+            tell("ready", ready=True)

@@ -35,7 +35,9 @@ def test_nothing_is_wished_before_a_key_is_pressed(terminal):
 def test_arming_stopping_and_arming_again(terminal):
     keys, operator, _ = terminal
     os.write(keys, b"a")
-    assert operator.read(1.0, -1.0).arm and operator.read(2.0, -1.0).arm
+    assert operator.read(1.0, -1.0).arm and operator.read(1.1, -1.0).arm and not operator.read(1.3, -1.0).arm
+    os.write(keys, b"a")  # refused the first time
+    assert operator.read(2.0, -1.0).arm
     os.write(keys, b" ")
     wish = operator.read(3.0, 1.0)
     assert wish.stop and not wish.arm

@@ -51,53 +51,43 @@ def when_running(launch, act, after: float = 0.3):
     threading.Thread(target=watch, daemon=True).start()
 
 
-def look(launch, seen):
-    """The motors' own log, on the launcher's clock."""
-    world = WorldRemote(launch.directory / "world.sock")
-    seen["log"], seen["epoch"] = world.motor_log, launch.clock.now() - world.time
-    world.close()
+def kill_and_watch(launch, name: str) -> dict:
+    """Kill a process of a running launch; a moment later ask the motors what they did, on their own clock."""
+    seen: dict = {}
+
+    def act():
+        world = WorldRemote(launch.directory / "world.sock")
+        before = world.status()
+        launch.children[name].process.kill()
+        time.sleep(0.5)
+        seen["slipped"] = world.status()["slipped"] - before["slipped"]
+        safe = [e for e in world.motor_log if e.event in ("damping", "watchdog") and e.time > before["time"]]
+        seen["after"] = {e.joint: e.time - before["time"] for e in reversed(safe)}  # the first of each joint
+        seen["events"] = {e.event for e in safe}
+        seen["mode"] = launch.mode
+        world.close()
+        launch.children["guardian"].process.terminate()
+
+    when_running(launch, act)
+    seen["summary"] = launch.run()
+    if seen["slipped"]:
+        pytest.skip(f"this machine is too slow to judge: the simulated motors lost {seen['slipped']:.3f} s")
+    return seen
 
 
 def test_a_killed_pilot_leaves_every_motor_damping_in_time(launch):
-    seen = {}
-
-    def kill():
-        seen["killed"] = launch.clock.now()
-        launch.children["pilot"].process.kill()
-        time.sleep(0.4)
-        seen["mode"] = launch.mode
-        look(launch, seen)
-        launch.children["guardian"].process.terminate()
-
-    when_running(launch, kill)
-    summary = launch.run()
-    assert seen["mode"] == Mode.DAMP
-    assert any("command" in m and "S2R" in m for m in summary.messages)
-    damped = {e.joint: e.time + seen["epoch"] for e in seen["log"] if e.event == "damping"}
-    assert set(damped) == set(launch.config.joint_names)
-    late = {j: t - seen["killed"] for j, t in damped.items() if t > seen["killed"]}
-    assert set(late) == set(launch.config.joint_names)
-    assert max(late.values()) < PROMISE
+    seen = kill_and_watch(launch, "pilot")
+    assert seen["mode"] == Mode.DAMP and seen["events"] == {"damping"}
+    assert any("S2R-018 command_age" in m or "S2R-017" in m for m in seen["summary"].messages)
+    assert set(seen["after"]) == set(launch.config.joint_names)
+    assert max(seen["after"].values()) < PROMISE
 
 
 def test_a_killed_guardian_is_replaced_by_the_last_will(launch):
-    seen = {}
-
-    def kill():
-        seen["killed"] = launch.clock.now()
-        launch.children["guardian"].process.kill()
-        time.sleep(0.4)
-        look(launch, seen)
-
-    when_running(launch, kill)
-    summary = launch.run()
-    assert any("guardian: died" in m for m in summary.messages)
-    after = [e for e in seen["log"] if e.time + seen["epoch"] > seen["killed"]]
-    safe = {
-        e.joint: e.time + seen["epoch"] - seen["killed"] for e in reversed(after) if e.event in ("damping", "watchdog")
-    }
-    assert set(safe) == set(launch.config.joint_names)
-    assert max(safe.values()) < PROMISE
+    seen = kill_and_watch(launch, "guardian")
+    assert any("guardian: died" in m for m in seen["summary"].messages)
+    assert set(seen["after"]) == set(launch.config.joint_names)
+    assert max(seen["after"].values()) < PROMISE
 
 
 RUN = """
