@@ -13,6 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
@@ -122,6 +123,10 @@ class Training:
         self.iteration, self.best = state["iteration"], state["best"]
         self.env.load_state_dict(state["env"])
         torch.set_rng_state(state["torch_rng"])
+        if self.rank > 0:  # the checkpoint holds the first process's dice: the others get their own
+            torch.manual_seed(self.config.seed + self.rank + self.iteration)
+            self.env.rng = np.random.default_rng([self.config.seed, self.rank, self.iteration])
+            self.env.reset()
         if self.rank == 0:  # what came after the checkpoint never happened
             curve = self.folder / "curve.jsonl"
             lines = curve.read_text().splitlines(keepends=True) if curve.is_file() else []
