@@ -115,7 +115,7 @@ def data_folder(data: Path | None) -> Path:
             return folder
     raise ClipError(
         f"no recordings: looked for INDEX.csv in {', '.join(map(str, candidates))}\n"
-        f"  give --data FOLDER or set {DATA}; docs/clips.md says where to get BallPlay-M and what INDEX.csv holds"
+        f"  give --data FOLDER or set {DATA}; docs/clips/README.md says where to get BallPlay-M and what INDEX.csv holds"
     )
 
 
