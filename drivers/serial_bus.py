@@ -7,7 +7,7 @@ A tick is one write: the goals of all servos, and behind them a request for the 
 **Turns.** Host and servos share the line, so that nothing must be sent while servos answer. A tick that comes while
 answers are still due is dropped and counted (``lost``, ``line_busy``): never queued for later. Answers are due until the
 last one came, or their time on the wire and REPLY_MARGIN have passed, so that a lost one costs less than that. Servos
-that stayed silent are asked last the next time, because those behind a silent one may have to wait for it.
+that stayed silent are asked last the next time, the first of them after all others: it may be what these waited for.
 The stop path does not take turns: ``disable`` sends at once, and every ``poll`` sends it again while a servo says that
 its torque is on.
 
@@ -57,6 +57,8 @@ class SerialCodec(Protocol):
     HAS_FAST_READ: bool
     checks: list[RegisterCheck]
     rejected: int
+
+    def pack_wake(self) -> bytes: ...
 
     def pack_command(self, command: MotorCommand) -> bytes: ...
 
@@ -123,7 +125,7 @@ class SerialBus:
         self._fast, self._open, self._due, self._order = False, False, -np.inf, self._everyone
         self._receive()  # what others left there
         self._codec.finish(self._state, clock.now())
-        self._transmit(self._codec.pack_disable(), required=True)
+        self._transmit(self._codec.pack_wake(), required=True)
         self._reboot(clock)
         values = {check.register: self._check(check, clock) for check in self._codec.checks}
         self._codec.configure(values)
@@ -286,7 +288,11 @@ class SerialBus:
             self.counters.received += self._codec.finish(self._state, self._heard)
             self.counters.rejected = self._codec.rejected
             answered = self._state.time > self._asked
-        self._order = self._everyone if whole else np.argsort(~answered, kind="stable")
+        if whole:
+            self._order = self._everyone
+        else:  # the first silent one may be the reason why those behind it are
+            silent = self._order[~answered[self._order]]
+            self._order = np.concatenate([self._order[answered[self._order]], silent[1:], silent[:1]])
         if self._fast:
             self._fast_failures = 0 if whole else self._fast_failures + 1
             if self._fast_failures >= FAST_FAILURES:

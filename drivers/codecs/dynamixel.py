@@ -431,6 +431,10 @@ class DynamixelCodec:
 
     # -- to the servos -----------------------------------------------------------------------------------------------
 
+    def pack_wake(self) -> bytes:
+        """Torque off, and answers to what will be asked."""
+        return self.pack_disable() + self.pack_write("STATUS_RETURN_LEVEL", [2] * len(self.ids))
+
     def pack_command(self, command: MotorCommand) -> bytes:
         """P gains and goal positions of all servos in one sync write. Saturates at the ranges of gain and position;
         raises ValueError for a value not finite."""

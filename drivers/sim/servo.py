@@ -68,7 +68,7 @@ class SimServos:
         self.spec = spec
         self.joints = [m.joint for m in spec.motors]
         self.log: list[MotorEvent] = []
-        self._body, self._fast, self._patient = body, fast, patient
+        self._body, self.fast, self._patient = body, fast, patient
         models = dynamixel.models_of(spec)
         n = len(models)
         self._sign = np.array([m.sign for m in spec.motors], float)
@@ -177,7 +177,7 @@ class SimServos:
             item = np.dtype([("id", "u1"), ("address", "<u2"), ("size", "<u2")])
             asked = np.frombuffer(p[: len(p) // 5 * 5], item).tolist()
         if fast:
-            if self._fast and asked:
+            if self.fast and asked:
                 yield self._answer_fast(asked, time)
             return
         same = len({a[1:] for a in asked}) == 1
