@@ -27,6 +27,8 @@ class Tick(NamedTuple):
 
 
 class Reward(NamedTuple):
+    """A term (N,) and what it counts for; a negative weight is a penalty."""
+
     weight: float
     term: Callable[[Tick], np.ndarray]
 

@@ -208,9 +208,16 @@ def load_graph(folder: Path, name: str = "best.pt") -> PolicyGraph:
 
 
 def load_config(folder: Path) -> Basics:
-    """The settings written beside a run's checkpoints."""
-    document = json.loads((folder / "config.json").read_text())["config"]
-    return Basics(**{k: tuple(v) if isinstance(v, list) else v for k, v in document.items()})
+    """The settings written beside a run's checkpoints. Raises Sim2realError if they are of another version."""
+    document: dict[str, Any] = json.loads((folder / "config.json").read_text())["config"]
+    settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in document.items()}
+    names = {f.name for f in dataclasses.fields(Basics)}
+    if strangers := sorted(set(settings) - names):
+        raise Sim2realError(
+            f"{folder / 'config.json'}: got settings {', '.join(strangers)}, which policies/basics.py does not have;"
+            " check out the revision named in that file, or train anew in another folder"
+        )
+    return Basics(**settings)
 
 
 def git_revision() -> str:
