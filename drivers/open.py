@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -31,10 +31,18 @@ def _can(name: str, codec: str) -> BusProtocol:
 PROTOCOLS: dict[str, BusProtocol] = {
     "damiao": _can("damiao", "Damiao"),
     "robstride": _can("robstride", "Robstride"),
+    "recoil": _can("recoil", "Recoil"),
+    "unitree_hg": BusProtocol("dds", "drivers.dds_bus:DdsBus", "drivers.codecs.unitree_hg:UnitreeHgCodec"),
+}
+
+WORLDS: dict[str, str] = {
+    "can": "drivers.sim.world:World",
+    "dds": "drivers.sim.dds_world:DdsWorld",
 }
 
 IMUS: dict[str, str] = {
     "hipnuc": "drivers.codecs.hipnuc:Parser",
+    "unitree_hg": "drivers.codecs.unitree_hg:ImuParser",
 }
 
 
@@ -50,6 +58,10 @@ def open_bus(spec: BusSpec, wire: Any = None) -> MotorBus:
 def open_codec(spec: BusSpec) -> Any:
     """The host's codec for the motors of ``spec``, without any wire. Raises BusError."""
     _known("protocol", spec.protocol, PROTOCOLS, f"bus {spec.name}")
+    if not spec.watchdog and PROTOCOLS[spec.protocol].wire != "dds":
+        raise BusError(
+            f"bus {spec.name}: got watchdog 0, expected more: '{spec.protocol}' has one, and it must be used"
+        )
     return load(PROTOCOLS[spec.protocol].codec)(spec)
 
 
@@ -60,11 +72,20 @@ def open_imu(spec: ImuSpec, wire: Any = None) -> Imu:
     return load("drivers.imu.serial:SerialImu")(spec, parser, open_wire(spec) if wire is None else wire)
 
 
+def open_world(model_path: Any, base: str, buses: Sequence[BusSpec], imu: ImuSpec, **options: Any) -> Any:
+    """The simulated twin of a wiring (a drivers.sim.world.World, see there): a body, motors and wires. Raises BusError."""
+    for spec in buses:
+        _known("protocol", spec.protocol, PROTOCOLS, f"bus {spec.name}")
+    wires = {PROTOCOLS[spec.protocol].wire for spec in buses}
+    kind = wires.pop() if len(wires) == 1 else "can"  # which says what it cannot have
+    return load(WORLDS.get(kind, WORLDS["can"]))(model_path, base, buses, imu, **options)
+
+
 def open_wire(spec: BusSpec | ImuSpec) -> Any:
     """The wire that ``spec.interface`` and ``spec.channel`` name. Raises BusError.
 
     ``sim``: a simulated bus served on the unix socket ``channel``. CAN: ``socketcan``, or any interface of python-can.
-    Serial: ``serial``.
+    Serial: ``serial``. DDS: ``dds``, and as channel a network interface.
     """
     is_bus = isinstance(spec, BusSpec)
     where = f"bus {spec.name}" if is_bus else "imu"
@@ -73,7 +94,9 @@ def open_wire(spec: BusSpec | ImuSpec) -> Any:
             _known("protocol", spec.protocol, PROTOCOLS, where)
         if is_bus and PROTOCOLS[spec.protocol].wire == "can":
             return _open_can(spec, where)
-        _known("interface", spec.interface, ("serial", "sim"), where)
+        if spec.interface == "dds" or (is_bus and PROTOCOLS[spec.protocol].wire == "dds"):
+            return _open_dds(spec, where)
+        _known("interface", spec.interface, ("serial", "sim") if is_bus else ("serial", "sim", "dds"), where)
         if spec.interface == "sim":
             return load("drivers.sim.socket_wire:SocketSerialWire")(spec.channel)
         return load("drivers.serial_wire:PySerialWire")(spec.channel, spec.bitrate if is_bus else spec.baud)
@@ -88,6 +111,16 @@ def _open_can(spec: BusSpec, where: str) -> Any:
         return load("drivers.can_wire:RawCanWire").open(spec.channel)
     _known("interface", spec.interface, ["sim", *load("drivers.can_wire:interfaces")()], where)
     return load("drivers.can_wire:PythonCanWire")(spec.interface, spec.channel, spec.bitrate)
+
+
+def _open_dds(spec: BusSpec | ImuSpec, where: str) -> Any:
+    _known("interface", spec.interface, ("dds", "sim"), where)
+    if spec.interface == "sim":
+        return load("drivers.sim.socket_wire:SocketDdsWire")(spec.channel)
+    try:
+        return load("drivers.dds_wire:open_dds")(spec)
+    except ImportError as error:
+        raise WireError(f"{error}; DDS needs an extra: pip install 'sim2real[dds]'") from None
 
 
 def load(path: str) -> Any:

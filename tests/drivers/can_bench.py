@@ -16,6 +16,7 @@ from drivers.sim.world import World
 RIGS: dict[str, tuple[str, list[tuple[int, int]]]] = {
     "damiao": ("DM8006", [(1, 0x11), (2, 0x12)]),
     "robstride": ("RS03", [(1, 0), (0x7F, 0)]),
+    "recoil": ("6512", [(1, 0), (63, 0)]),
 }
 RATE = 250.0  # Hz
 
