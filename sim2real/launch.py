@@ -239,7 +239,8 @@ class Launch:
             self.config.wiring(self.wiring),
             simulated_in=str(self.directory) if self.simulated else None,
         )
-        damp = JointCommand(0.0, zero, zero, zero, zero, self.config.damping)
+        anywhere = np.clip(zero, self.config.position_min, self.config.position_max)  # kp is 0
+        damp = JointCommand(0.0, anywhere, zero, zero, zero, self.config.damping)
         schedule = Schedule(self.clock, 0.005)
         schedule.start(self.clock.now())
         for _ in range(400):  # 2 s: longer than any fall
