@@ -28,7 +28,7 @@ class Budget(NamedTuple):
 
     bus: str
     rate: float
-    frames: int  # a tick: a command and an answer for each motor
+    frames: int  # a tick: a command and an answer for each motor, or TICK_FRAMES of the codec
     bits: float  # a tick, typical
     bits_worst: float  # a tick, the most that stuffing can make of it
     load: float
@@ -45,11 +45,12 @@ class Budget(NamedTuple):
 def budget(spec: BusSpec, rate: float) -> Budget:
     """The load of ``spec`` when every motor is commanded and answers ``rate`` times a second."""
     n = len(spec.motors)
-    typical, worst = (n * bits for bits in load(PROTOCOLS[spec.protocol].codec).TICK_BITS)
+    codec = load(PROTOCOLS[spec.protocol].codec)
+    typical, worst = (n * bits for bits in codec.TICK_BITS)
     return Budget(
         bus=spec.name,
         rate=rate,
-        frames=2 * n,
+        frames=getattr(codec, "TICK_FRAMES", 2 * n),
         bits=typical,
         bits_worst=worst,
         load=typical * rate / spec.bitrate,

@@ -47,7 +47,7 @@ class BusSpec:
 
     ``interface`` and ``channel`` are python-can's words for CAN (``socketcan``, ``can0``) and ``serial`` plus a device
     for serial buses. ``bitrate`` in bit/s. ``watchdog``: seconds after which a motor without commands must stop by
-    itself; programmed and read back before torque.
+    itself; programmed and read back before torque. 0: it has none, and a person accepts that.
     """
 
     name: str

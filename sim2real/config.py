@@ -102,7 +102,7 @@ class BusConfig(Strict):
     interface: str = "socketcan"
     channel: str = ""
     bitrate: Annotated[int, Field(gt=0)] = 1_000_000
-    watchdog: Positive = 0.08
+    watchdog: Unsigned = 0.08  # s; 0: the device has none, and somebody accepts that
     motors: Annotated[list[MotorConfig], Field(min_length=1)]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from drivers.sim.world import World
+from drivers.open import open_world
 from sim2real.channel import Channel
 from sim2real.clock import Schedule, SimClock
 from sim2real.config import RobotConfig
@@ -64,7 +64,7 @@ class Simulation:
         wiring = self.config.wiring(self.wiring)
         player = SkillPlayer(self.config, self.policies)
         scene = self.scene
-        self.world = World(
+        self.world = open_world(
             self.config.model_path,
             self.config.base,
             wiring.bus_specs(),

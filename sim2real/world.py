@@ -14,14 +14,14 @@ PRIORITY = 60  # below the guardian's and the pilot's
 
 def main(directory: Path) -> int:
     """Serve the world of the run in ``directory`` until the launcher goes."""
+    from drivers.open import open_world
     from drivers.sim.serve import serve
-    from drivers.sim.world import World
     from sim2real.simulation import SETTLE
 
     life = Life()
     spec = RunSpec.load(directory)
     config, wiring = spec.open()
-    world = World(
+    world = open_world(
         config.model_path,
         config.base,
         wiring.bus_specs(),

@@ -105,14 +105,14 @@ class Model(NamedTuple):
     velocity: float
 
 
-# Named by rotor and gear. The maker's URDF says 35 N m for the pairs of 5020, its MJCF 50.
+# Named by the size of their rotor and their gear. The maker's URDF says 35 N m for the pairs of 5020, its MJCF 50.
 MODELS: dict[str, Model] = {
-    "7520_14": Model(88, 32),
-    "7520_22": Model(139, 20),
-    "5020x2": Model(50, 30),
-    "5020": Model(25, 37),
-    "4010": Model(5, 22),
-    "5010": Model(13.4, 27),
+    "M7520-14": Model(88, 32),
+    "M7520-22": Model(139, 20),
+    "M5020x2": Model(50, 30),
+    "M5020": Model(25, 37),
+    "M4010": Model(5, 22),
+    "M5010": Model(13.4, 27),
 }
 
 
@@ -131,28 +131,28 @@ SHORT = frozenset({13, 14, 20, 21, 27, 28})  # 23 joints
 ARMS = frozenset(range(15))  # no legs and no waist
 
 VARIANTS: dict[int, Variant] = {
-    1: Variant("g1_23dof, deprecated", "7520_14", "7520_14", "4010", SHORT),
-    2: Variant("g1_29dof, deprecated", "7520_14", "7520_14", "4010"),
-    3: Variant("g1_29dof_lock_waist, deprecated", "7520_14", "7520_14", "4010", LOCKED_WAIST),
-    4: Variant("g1_23dof_rev_1_0", "7520_14", "7520_22", "4010", SHORT),
-    5: Variant("g1_29dof_rev_1_0", "7520_14", "7520_22", "4010"),
-    6: Variant("g1_29dof_lock_waist_rev_1_0", "7520_14", "7520_22", "4010", LOCKED_WAIST),
-    9: Variant("g1_dual_arm", "", "", "4010", ARMS),
-    10: Variant("g1_23dof_mode_10", "7520_22", "7520_22", "4010", SHORT),
-    11: Variant("g1_29dof_mode_11", "7520_22", "7520_22", "4010"),
-    12: Variant("g1_29dof_mode_12", "7520_22", "7520_22", "4010", LOCKED_WAIST),
-    13: Variant("g1_29dof_mode_13", "7520_14", "7520_22", "5010"),
-    14: Variant("g1_29dof_mode_14", "7520_14", "7520_22", "5010", LOCKED_WAIST),
-    15: Variant("g1_29dof_mode_15", "7520_22", "7520_22", "5010"),
-    16: Variant("g1_29dof_mode_16", "7520_22", "7520_22", "5010", LOCKED_WAIST),
+    1: Variant("g1_23dof, deprecated", "M7520-14", "M7520-14", "M4010", SHORT),
+    2: Variant("g1_29dof, deprecated", "M7520-14", "M7520-14", "M4010"),
+    3: Variant("g1_29dof_lock_waist, deprecated", "M7520-14", "M7520-14", "M4010", LOCKED_WAIST),
+    4: Variant("g1_23dof_rev_1_0", "M7520-14", "M7520-22", "M4010", SHORT),
+    5: Variant("g1_29dof_rev_1_0", "M7520-14", "M7520-22", "M4010"),
+    6: Variant("g1_29dof_lock_waist_rev_1_0", "M7520-14", "M7520-22", "M4010", LOCKED_WAIST),
+    9: Variant("g1_dual_arm", "", "", "M4010", ARMS),
+    10: Variant("g1_23dof_mode_10", "M7520-22", "M7520-22", "M4010", SHORT),
+    11: Variant("g1_29dof_mode_11", "M7520-22", "M7520-22", "M4010"),
+    12: Variant("g1_29dof_mode_12", "M7520-22", "M7520-22", "M4010", LOCKED_WAIST),
+    13: Variant("g1_29dof_mode_13", "M7520-14", "M7520-22", "M5010"),
+    14: Variant("g1_29dof_mode_14", "M7520-14", "M7520-22", "M5010", LOCKED_WAIST),
+    15: Variant("g1_29dof_mode_15", "M7520-22", "M7520-22", "M5010"),
+    16: Variant("g1_29dof_mode_16", "M7520-22", "M7520-22", "M5010", LOCKED_WAIST),
 }
 
 
 def models_of(variant: Variant) -> tuple[str, ...]:
     """The motor at each of JOINTS (29,); "" where there is none."""
-    leg = (variant.hip_pitch, variant.hip_roll, "7520_14", "7520_22", "5020x2", "5020x2")
-    arm = ("5020",) * 5 + (variant.wrist,) * 2
-    models = (*leg, *leg, "7520_14", "5020x2", "5020x2", *arm, *arm)
+    leg = (variant.hip_pitch, variant.hip_roll, "M7520-14", "M7520-22", "M5020x2", "M5020x2")
+    arm = ("M5020",) * 5 + (variant.wrist,) * 2
+    models = (*leg, *leg, "M7520-14", "M5020x2", "M5020x2", *arm, *arm)
     return tuple("" if i in variant.absent else model for i, model in enumerate(models))
 
 
@@ -210,6 +210,7 @@ class UnitreeHgCodec:
     # Bits on the Ethernet for each of 29 motors: a LowCmd (1004 bytes) and a LowState (2092, in two packets) with RTPS,
     # UDP, IP and Ethernet around them (about 150 bytes a packet).
     TICK_BITS = ((1004 + 2092 + 3 * 150) * 8 / len(JOINTS),) * 2
+    TICK_FRAMES = 2  # one sample each way
 
     def __init__(self, spec: BusSpec) -> None:
         """Raises BusError for a slot or a model that no G1 has, or a joint in another's slot."""

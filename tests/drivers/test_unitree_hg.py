@@ -201,7 +201,7 @@ def test_only_the_variant_of_the_wiring_fits():
     codec = hg.UnitreeHgCodec(SPEC)
     assert [v for v in hg.VARIANTS if not codec.misfits(v)] == [5]
     assert codec.misfits(11)[0] == (
-        "left_hip_pitch_joint: the robot has a 7520_22 (139 N m, 20 rad/s), the wiring a 7520_14 (88 N m, 32 rad/s)"
+        "left_hip_pitch_joint: the robot has a M7520-22 (139 N m, 20 rad/s), the wiring a M7520-14 (88 N m, 32 rad/s)"
     )
     assert "waist_roll_joint: the robot has no motor" in codec.misfits(6)[0]
     assert codec.misfits(0) == ["mode_machine 0 is no variant known here"]
@@ -210,8 +210,8 @@ def test_only_the_variant_of_the_wiring_fits():
 @pytest.mark.parametrize(
     ("motor", "message"),
     [
-        (MotorSpec("left_knee_joint", "7520_22", 29), "got id 29, expected 0 to 28"),
-        (MotorSpec("left_knee_joint", "7520_22", 4), "slot of left_ankle_pitch"),
+        (MotorSpec("left_knee_joint", "M7520-22", 29), "got id 29, expected 0 to 28"),
+        (MotorSpec("left_knee_joint", "M7520-22", 4), "slot of left_ankle_pitch"),
         (MotorSpec("left_knee_joint", "DM8009", 3), "no motor 'DM8009' in a G1"),
     ],
 )

@@ -1,0 +1,252 @@
+"""A World whose robot is reached over DDS: samples on topics instead of frames on buses.
+
+A sample takes ``latency`` and arrives whole, or is lost; loopback and a quiet Ethernet are like that. Faults befall what
+travels between the host and the robot, by bus, or as ``imu`` what the IMU's reader gets.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import random
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from heapq import heappop, heappush
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drivers.bus import BusError, BusSpec, ImuSpec
+from drivers.codecs import unitree_hg as hg
+from drivers.dds_bus import StateStream
+from drivers.sim.dds_robot import SimG1, only_bus
+from drivers.sim.faults import IMU, POWER, Fault, parse_fault
+from drivers.sim.imu import ImuNoise, multiply
+from drivers.sim.plant import Plant
+from drivers.sim.wire import TOLERANCE
+from drivers.sim.world import World
+from drivers.wire import WireError
+
+BLOCK = 256  # samples of noise drawn at once
+FAULTS = ("drop", "delay", "corrupt", "duplicate", "stuck", "off", "reboot")  # those of faults.KINDS that DDS can have
+
+
+class Link:
+    """One way of one reader or writer, with what goes wrong on it."""
+
+    def __init__(self, seed: str) -> None:
+        self.faults: list[Fault] = []
+        self.dropped = self.corrupted = 0
+        self._random = random.Random(seed)
+        self._stuck: dict[tuple[int, str], bytes] = {}
+
+    def pass_on(self, topic: str, payload: bytes, now: float) -> list[tuple[float, bytes]]:
+        """What becomes of a sample: (s of delay, payload) of every copy that arrives."""
+        delay, copies = 0.0, 1
+        for fault in self.faults:
+            if not fault.start <= now < fault.end or self._random.random() >= fault.probability:
+                continue
+            if fault.kind in ("drop", "off"):
+                self.dropped += 1
+                return []
+            if fault.kind == "delay":
+                delay += fault.value
+            elif fault.kind == "duplicate":
+                copies = 2
+            elif fault.kind == "stuck":
+                payload = self._stuck.setdefault((id(fault), topic), payload)
+            elif fault.kind == "corrupt":
+                self.corrupted += 1
+                spoiled = bytearray(payload)
+                at = self._random.randrange(32, 8 * len(payload))
+                spoiled[at // 8] ^= 1 << at % 8
+                payload = bytes(spoiled)
+        return [(delay, payload)] * copies
+
+
+class DdsWorld(World):
+    """A G1 in MuJoCo behind simulated DDS. Arguments as for World; ``robot``: what else SimG1 takes.
+
+    ``others``: how many other programs publish LowCmd, as far as a host can see (they say nothing here).
+    """
+
+    def __init__(
+        self,
+        model_path: str | Path,
+        base: str,
+        buses: Sequence[BusSpec],
+        imu: ImuSpec,
+        *,
+        timestep: float = 0.002,
+        seed: int = 0,
+        faults: Sequence[Fault | str] = (),
+        prepare: Callable[[Any], None] | None = None,
+        joint_pos: Mapping[str, float] | None = None,
+        hang: float | None = 0.01,
+        noise: float = 0.0,
+        imu_noise: ImuNoise | None = None,
+        latency: float = 250e-6,
+        others: int = 0,
+        **robot: Any,
+    ):
+        spec = only_bus(buses)
+        joints = [m.joint for m in spec.motors]
+        self.time = 0.0
+        self.plant = Plant(model_path, joints, base, timestep, prepare, imu.site)
+        self.plant.reset(joint_pos, hang=hang, noise=noise, seed=seed)
+        self.motors = SimG1(spec, self.plant, **robot)  # type: ignore[assignment]
+        self.buses = []
+        self.others = others
+        self.imu = StatePublisher(self, imu, seed, imu_noise or ImuNoise())  # type: ignore[assignment]
+        self.up = Link(f"{seed}/{spec.name}/up")  # from the host to the robot
+        self._down = {spec.name: SimDdsWire(self, f"{seed}/{spec.name}/down"), IMU: SimDdsWire(self, f"{seed}/{IMU}")}
+        self.wires = {spec.name: self._down[spec.name]}  # type: ignore[assignment]
+        self.imu_wire = StateStream(self._down[IMU])  # type: ignore[assignment]
+        self.latency = latency
+        self._timestep = timestep
+        self._substeps = 0
+        self._sha = hashlib.sha256()
+        self._power = []
+        self._travelling: list[tuple[float, int, str, bytes]] = []  # heap of (arrival, order, topic, payload)
+        self._sent = self._published = 0
+        for fault in faults:
+            self.inject(fault)
+
+    def send(self, topic: str, payload: bytes) -> None:
+        """A sample leaves the host."""
+        for delay, copy in self.up.pass_on(topic, payload, self.time):
+            self._sent += 1
+            heappush(self._travelling, (self.time + self.latency + delay, self._sent, topic, copy))
+
+    def publish(self, topic: str, payload: bytes, time: float) -> None:
+        """A sample leaves the robot, for every reader."""
+        self._published += 1
+        self._sha.update(topic.encode() + payload)
+        for wire in self._down.values():
+            for delay, copy in wire.link.pass_on(topic, payload, time):
+                wire.arrive(time + self.latency + delay, topic, copy)
+
+    def _carry(self, until: float) -> None:
+        while self._travelling and self._travelling[0][0] <= until + TOLERANCE:
+            time, _, topic, payload = heappop(self._travelling)
+            self._sha.update(topic.encode() + payload)
+            for answer in self.motors.receive(topic, payload, time):
+                self.publish(*answer, time)
+
+    @property
+    def busy(self) -> bool:
+        return bool(self._travelling) or any(wire.busy for wire in self._down.values())
+
+    def inject(self, fault: Fault | str) -> None:
+        """Make something go wrong. Raises BusError for a fault that DDS does not have, or that befalls nothing here."""
+        fault = parse_fault(fault) if isinstance(fault, str) else fault
+        name, joints = self.motors.spec.name, self.motors.joints
+        if fault.kind not in FAULTS:
+            raise BusError(f"fault: got kind '{fault.kind}', expected one that DDS can have: {', '.join(FAULTS)}")
+        if fault.bus == IMU:
+            self._down[IMU].link.faults.append(fault)
+            return
+        rows = [row for row, joint in enumerate(joints) if fault.befalls(name, joint)]
+        if not rows:
+            raise BusError(
+                f"fault '{fault.kind}': nothing here is '{fault.bus}/{fault.motor}', expected {name} or {IMU} and, after a "
+                "slash, one of its joints"
+            )
+        if fault.kind in POWER:
+            back = fault.start + fault.value if fault.kind == "reboot" else fault.end
+            for row in rows:
+                heappush(self._power, (fault.start, len(self._power), row, False))
+                if back < math.inf:
+                    heappush(self._power, (back, len(self._power), row, True))
+        elif fault.motor != "*":
+            raise BusError(f"fault '{fault.kind}': a sample holds all motors; expected '{fault.kind}:{name}'")
+        else:
+            self._down[name].link.faults.append(fault)
+            if fault.kind != "stuck":  # of what the robot says
+                self.up.faults.append(fault)
+
+    def counters(self) -> dict[str, dict[str, float]]:
+        """By bus: samples sent to the robot, published by it, and lost or damaged between."""
+        name = self.motors.spec.name
+        down = self._down[name].link
+        return {
+            name: {
+                "sent": self._sent,
+                "published": self._published,
+                "ignored": self.motors.ignored,
+                "dropped": self.up.dropped + down.dropped,
+                "corrupted": self.up.corrupted + down.corrupted,
+            }
+        }
+
+
+class StatePublisher:
+    """Publishes LowState every 1/rate s, with noise on what the IMU in it says."""
+
+    def __init__(self, world: DdsWorld, spec: ImuSpec, seed: int, noise: ImuNoise) -> None:
+        if spec.orientation_imu_in_base != (1.0, 0.0, 0.0, 0.0):
+            raise BusError("imu: a G1's is mounted straight; expected orientation_imu_in_base 1, 0, 0, 0")
+        self._world, self._period = world, 1.0 / spec.rate
+        self._samples = 0
+        self._generator = np.random.default_rng([seed, 0x1A])
+        self._scale = np.repeat([noise.orientation / 2, noise.angular_velocity, noise.acceleration], 3)
+        self._mean = np.concatenate([np.zeros(3), noise.angular_velocity_bias, noise.acceleration_bias])
+
+    def sample(self, now: float) -> None:
+        """Publish what is due by ``now``."""
+        if now + TOLERANCE < (self._samples + 1) * self._period:
+            return
+        at = self._samples % BLOCK
+        self._samples += 1
+        if at == 0:
+            self._block = self._generator.standard_normal((BLOCK, 9)) * self._scale + self._mean
+        noise, plant = self._block[at], self._world.plant
+        orientation = np.array(multiply(plant.orientation_imu_in_world.tolist(), (1.0, *noise[:3].tolist())))
+        imu = (
+            orientation / np.linalg.norm(orientation),
+            plant.angular_velocity_imu_in_imu + noise[3:6],
+            plant.acceleration_imu_in_imu + noise[6:9],
+        )
+        self._world.publish(hg.STATE_TOPIC, self._world.motors.state(imu, now), now)
+
+
+class SimDdsWire:
+    """A host's end of a simulated domain: a drivers.wire.DdsWire."""
+
+    def __init__(self, world: DdsWorld, seed: str) -> None:
+        self.link = Link(seed)
+        self._world = world
+        self._inbox: dict[str, deque[tuple[float, bytes]]] = {}
+        self._open = True
+
+    def arrive(self, time: float, topic: str, payload: bytes) -> None:
+        """A sample that can be read from ``time`` on. What nobody reads is lost, the oldest first."""
+        self._inbox.setdefault(topic, deque(maxlen=16)).append((time, payload))
+
+    @property
+    def busy(self) -> bool:
+        return any(self._inbox.values())
+
+    def write(self, topic: str, payload: bytes) -> None:
+        self._check()
+        self._world.send(topic, payload)
+
+    def read(self, topic: str) -> list[bytes]:
+        self._check()
+        inbox = self._inbox.get(topic, ())
+        arrived = [payload for time, payload in inbox if time <= self._world.time + TOLERANCE]
+        if arrived:
+            rest = [sample for sample in inbox if sample[0] > self._world.time + TOLERANCE]
+            self._inbox[topic] = deque(rest, maxlen=16)
+        return arrived
+
+    def writers(self, topic: str) -> int:
+        return self._world.others if topic == hg.COMMAND_TOPIC else 0
+
+    def close(self) -> None:
+        self._open = False
+
+    def _check(self) -> None:
+        if not self._open:
+            raise WireError("used after close; open the wire again")
