@@ -46,6 +46,7 @@ CLEAR_TURNS = bytes([0x01, 0x44, 0x58, 0x4C, 0x22])  # parameters of CLEAR: the 
 VELOCITY_STIFFNESS = 10.0  # times the back-EMF, in velocity mode
 
 CURRENT_MODE, VELOCITY_MODE, POSITION_MODE, EXTENDED_MODE, CURRENT_POSITION_MODE, PWM_MODE = 0, 1, 3, 4, 5, 16
+DRIVEN_BY = {CURRENT_MODE: "GOAL_CURRENT", VELOCITY_MODE: "GOAL_VELOCITY", PWM_MODE: "GOAL_PWM"}  # 0 at torque-on
 
 
 class SimServos:
@@ -434,8 +435,10 @@ class SimServos:
     def _switch(self, row: int, on: bool, time: float, event: str) -> None:
         self._table[row, RAM] = on
         if on:  # it stays where it is
-            low, high = REGISTERS["GOAL_POSITION"].low, REGISTERS["GOAL_POSITION"].high
-            self._set(row, "GOAL_POSITION", min(high, max(low, round(float(self.position[row])))))
+            r, mode = REGISTERS["GOAL_POSITION"], self._get(row, "OPERATING_MODE")
+            self._set(row, "GOAL_POSITION", min(r.high, max(r.low, round(float(self.position[row])))))
+            if mode in DRIVEN_BY:
+                self._set(row, DRIVEN_BY[mode], 0)
         self._stale = self._changed = True
         self._note(time, row, event)
 
