@@ -1,0 +1,56 @@
+"""`sim2real train` and `sim2real eval` as a user meets them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+
+import pytest
+
+from policies import train
+from policies.basics import Basics
+from sim2real.cli import main
+from sim2real.cli.train import training_side
+from sim2real.types import Sim2realError
+
+TINY = Basics(envs=8, horizon=4, hidden=(16,), save_every=2, evaluate_every=2, evaluate_envs=2, samples=64,
+              ppo={**Basics().ppo, "num_mini_batches": 2})  # fmt: skip
+
+
+def test_without_its_extra_train_says_what_to_install(monkeypatch, capsys, tmp_path):
+    for name in [m for m in sys.modules if m.partition(".")[0] in ("policies", "rsl_rl")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "rsl_rl", None)  # what the import system does for a module that is not there
+    with pytest.raises(Sim2realError, match=r"pip install 'sim2real\[train\]'"):
+        training_side("policies.train")
+    assert main(["train", "g1-basics", "--folder", str(tmp_path)]) == 2
+    assert "sim2real[train]" in capsys.readouterr().err
+
+
+def test_train_trains_evaluates_itself_and_resumes(capsys, tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.json").write_text(json.dumps({"config": dataclasses.asdict(TINY)}))
+    assert main(["train", "g1-basics", "--folder", str(run), "--seed", "3"]) == 0
+    first = capsys.readouterr().out
+    assert "training in" in first and "survive 10 s" in first and "best:" in first
+    assert train.load_config(run).seed == 3
+    assert {p.name for p in run.iterdir()} == {"config.json", "curve.jsonl", "last.pt", "best.pt"}
+    assert main(["train", "g1-basics", "--folder", str(run), "--samples", "128"]) == 0
+    assert "resuming" in capsys.readouterr().out
+    assert len((run / "curve.jsonl").read_text().splitlines()) == 4
+
+
+def test_settings_of_another_version_are_named(tmp_path):
+    train.Training(dataclasses.replace(TINY, samples=0), tmp_path).run()
+    document = (tmp_path / "config.json").read_text()
+    (tmp_path / "config.json").write_text(document.replace('"gamma"', '"gamme"'))
+    with pytest.raises(Sim2realError, match="gamme"):
+        train.load_config(tmp_path)
+
+
+def test_eval_refuses_what_is_no_policy(capsys, tmp_path):
+    (tmp_path / "no.onnx").write_bytes(b"no")
+    assert main(["eval", str(tmp_path / "no.onnx")]) == 2
+    assert "no.onnx" in capsys.readouterr().err
