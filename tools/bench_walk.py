@@ -33,7 +33,7 @@ def rows() -> Iterator[Row]:
             f"adopted walk, 0.5 m/s for 20 s through CAN, {len(runs)} seeds{words}",
             f"{np.mean(velocities):.3f} m/s, {falls} of {len(runs)} fell or stopped",
             f"{recorded:.3f} m/s in its own simulation",
-            f"at most {off:.1%} off",
+            f"{np.mean(velocities) / recorded - 1:+.1%}, one seed {off:.1%} off",
             "none falls" if faults else f"none falls, each within {TOLERANCE:.0%}",
             falls == 0 and (bool(faults) or off <= TOLERANCE),
             {"velocities": velocities, "recorded": recorded, "falls": falls},
