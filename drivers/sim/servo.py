@@ -65,10 +65,11 @@ class SimServos:
         registers: Mapping[str, Mapping[str, int]] | None = None,
         fast: bool = True,
         patient: bool = False,
+        log: list[MotorEvent] | None = None,
     ):
         self.spec = spec
         self.joints = [m.joint for m in spec.motors]
-        self.log: list[MotorEvent] = []
+        self.log = [] if log is None else log
         self._body, self.fast, self._patient = body, fast, patient
         models = dynamixel.models_of(spec)
         n = len(models)
