@@ -32,12 +32,14 @@ PROTOCOLS: dict[str, BusProtocol] = {
     "damiao": _can("damiao", "Damiao"),
     "robstride": _can("robstride", "Robstride"),
     "recoil": _can("recoil", "Recoil"),
+    "dynamixel": BusProtocol("serial", "drivers.serial_bus:SerialBus", "drivers.codecs.dynamixel:DynamixelCodec"),
     "unitree_hg": BusProtocol("dds", "drivers.dds_bus:DdsBus", "drivers.codecs.unitree_hg:UnitreeHgCodec"),
 }
 
 WORLDS: dict[str, str] = {
     "can": "drivers.sim.world:World",
     "dds": "drivers.sim.dds_world:DdsWorld",
+    "serial": "drivers.sim.serial_world:SerialWorld",
 }
 
 IMUS: dict[str, str] = {
