@@ -46,7 +46,8 @@ def budget(spec: BusSpec, rate: float) -> Budget:
     """The load of ``spec`` when every motor is commanded and answers ``rate`` times a second."""
     n = len(spec.motors)
     codec = load(PROTOCOLS[spec.protocol].codec)
-    typical, worst = (n * bits for bits in codec.TICK_BITS)
+    overhead = getattr(codec, "TICK_OVERHEAD_BITS", 0.0)  # of packets that hold all motors
+    typical, worst = (n * bits + overhead for bits in codec.TICK_BITS)
     return Budget(
         bus=spec.name,
         rate=rate,
