@@ -29,6 +29,7 @@ GAIT_PERIOD = 0.8  # s, a constant of the deploy scripts
 # rad. In g1_12dof.xml pelvis, waist and arms have their centre of mass 14.5 mm ahead of the pelvis; a 29-joint G1 with
 # straight arms has it at 22.6 mm (it has wrists and hands) and walks a quarter too fast. With these it is at 14.5 mm.
 BALANCED = {"left_shoulder_pitch_joint": 0.155, "right_shoulder_pitch_joint": 0.155}
+ARM_KP, WRIST_KP = 20.0, 8.0  # N m/rad: overdamped with kd 5 and 3, the most a motor takes
 LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
 ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
 MOTORS = {  # robot -> joint of each motor index of the maker's SDK
@@ -246,11 +247,15 @@ def _fields(config: Config, robot: RobotConfig, file: Path, hidden: int) -> dict
     else:
         rows = zip(robot.joint_names, robot.home_kp, robot.home_kd, strict=True)
         hold = {j: {"position": 0.0, "kp": kp, "kd": kd} for j, kp, kd in rows if j not in joints}
-    # The network was trained with this upper body welded: hold it as stiffly as the motors allow, in the posture that has
-    # its centre of mass where the training model had it.
+    # The network was trained with this upper body welded: the waist as stiff as the motors allow, the arms so soft for
+    # their damping that they do not swing, all in the posture that has its centre of mass where the training model had it.
     for joint, plan in hold.items():
+        i = robot.joint_names.index(joint)
         plan["position"] = BALANCED.get(joint, plan["position"])
-        plan["kd"] = float(robot.kd_max[robot.joint_names.index(joint)])
+        plan["kd"] = float(robot.kd_max[i])
+        plan["kp"] = (
+            max(plan["kp"], float(robot.kp_max[i])) if "waist" in joint else WRIST_KP if "wrist" in joint else ARM_KP
+        )
     carry = {"carry_action": n, "carry_hidden": hidden, "carry_cell": hidden, "carry_step": 1}
     return {
         "name": "unitree_rl_gym_walk",

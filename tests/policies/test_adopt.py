@@ -62,8 +62,8 @@ def test_contract(source, tmp_path):
     assert contract.joint_names == contract.target_joint_names == list(G1.joint_names[:12])
     assert list(contract.hold) == list(G1.joint_names[12:])
     waist, shoulder = contract.hold["waist_yaw_joint"], contract.hold["left_shoulder_pitch_joint"]
-    assert (waist.position, waist.kp, waist.kd) == (0.0, 300.0, 5.0)  # kd: as stiff as the motor allows
-    assert (shoulder.position, shoulder.kp) == (BALANCED["left_shoulder_pitch_joint"], 100.0)
+    assert (waist.position, waist.kp, waist.kd) == (0.0, 400.0, 5.0)  # as stiff as the motor allows
+    assert (shoulder.position, shoulder.kp) == (BALANCED["left_shoulder_pitch_joint"], 20.0)
     assert contract.command_velocity_max == (0.8, 0.5, 1.57) and contract.period == 0.02
     assert contract.skill_labels == ("walk",) and contract.provenance.licence == "BSD-3-Clause"
     assert len(contract.golden) == 3 and policy.golden_error < 1e-5
@@ -92,7 +92,7 @@ def test_gravity_in_observation(source, tmp_path):
 def test_without_the_real_robots_configuration_the_rest_is_held_as_in_training(source, tmp_path):
     contract = walk(source, tmp_path, configs=[source / "config_mujoco_g1.yaml"]).contract
     elbow = contract.hold["left_elbow_joint"]
-    assert (elbow.position, elbow.kp, elbow.kd) == (0.0, 40.0, 5.0) and len(contract.hold) == 17
+    assert (elbow.position, elbow.kp, elbow.kd) == (0.0, 20.0, 5.0) and len(contract.hold) == 17
     assert contract.command_velocity_max == (0.5, 0.0, 0.0)
 
 
