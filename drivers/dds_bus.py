@@ -27,6 +27,7 @@ ANSWER_TIME = 1.0  # s to wait for a service's answer to one try
 TRIES = 3  # of a request
 RELEASES = 5  # how often the robot's controllers are asked to let go
 RELEASE_TIME = 1.0  # s that they have for it each time
+SETTLE_TIME = 0.02  # s until a command shows in what the robot says
 DISABLE_TIME = 0.5  # s for every motor to say that it is disabled
 
 
@@ -64,6 +65,8 @@ class DdsBus:
                 "their commands would alternate with ours\n  Stop that program, on this computer or on the robot's"
             )
         self._transmit(self._codec.pack_disable(self._known()))
+        clock.sleep_until(clock.now() + SETTLE_TIME)
+        self.read(clock.now())  # what was said before that arrived
         if not self._wait(clock, DISABLE_TIME, lambda: not self._state.enabled.any()):
             on = [m.joint for m, enabled in zip(self.spec.motors, self._state.enabled, strict=True) if enabled]
             raise BusError(f"{self._name()}: {', '.join(on)} enabled, expected disabled while connecting")

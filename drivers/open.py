@@ -19,19 +19,22 @@ class BusProtocol(NamedTuple):
     bus: str
     codec: str
     motors: str = ""
+    watchdog: bool = True  # connecting programs one
 
 
-def _can(name: str, codec: str) -> BusProtocol:
+def _can(name: str, codec: str, watchdog: bool = True) -> BusProtocol:
     """A protocol on CanBus: its codec, and in drivers/sim its motors, are files of its ``name``."""
-    return BusProtocol(
-        "can", "drivers.can_bus:CanBus", f"drivers.codecs.{name}:{codec}Codec", f"drivers.sim.{name}:Sim{codec}"
-    )
+    codec_path, motors_path = f"drivers.codecs.{name}:{codec}Codec", f"drivers.sim.{name}:Sim{codec}"
+    return BusProtocol("can", "drivers.can_bus:CanBus", codec_path, motors_path, watchdog)
 
 
 PROTOCOLS: dict[str, BusProtocol] = {
     "damiao": _can("damiao", "Damiao"),
     "robstride": _can("robstride", "Robstride"),
     "recoil": _can("recoil", "Recoil"),
+    "mini_cheetah": _can("mini_cheetah", "MiniCheetah", watchdog=False),
+    "cubemars": _can("cubemars", "Cubemars", watchdog=False),
+    "robstride_mit": _can("robstride_mit", "RobstrideMit", watchdog=False),
     "dynamixel": BusProtocol("serial", "drivers.serial_bus:SerialBus", "drivers.codecs.dynamixel:DynamixelCodec"),
     "unitree_hg": BusProtocol("dds", "drivers.dds_bus:DdsBus", "drivers.codecs.unitree_hg:UnitreeHgCodec"),
 }
@@ -60,11 +63,18 @@ def open_bus(spec: BusSpec, wire: Any = None) -> MotorBus:
 def open_codec(spec: BusSpec) -> Any:
     """The host's codec for the motors of ``spec``, without any wire. Raises BusError."""
     _known("protocol", spec.protocol, PROTOCOLS, f"bus {spec.name}")
-    if not spec.watchdog and PROTOCOLS[spec.protocol].wire != "dds":
+    protocol = PROTOCOLS[spec.protocol]
+    if spec.watchdog and not protocol.watchdog and protocol.wire == "can":
+        raise BusError(
+            f"bus {spec.name}: got watchdog {spec.watchdog:g} s, expected 0: no frame of '{spec.protocol}' programs one.\n"
+            "  With 0 the wiring says that these motors may go on without the host; set their own time-out with the "
+            "maker's tool"
+        )
+    if not spec.watchdog and protocol.watchdog and protocol.wire != "dds":
         raise BusError(
             f"bus {spec.name}: got watchdog 0, expected more: '{spec.protocol}' has one, and it must be used"
         )
-    return load(PROTOCOLS[spec.protocol].codec)(spec)
+    return load(protocol.codec)(spec)
 
 
 def open_imu(spec: ImuSpec, wire: Any = None) -> Imu:
@@ -118,7 +128,7 @@ def _open_can(spec: BusSpec, where: str) -> Any:
 def _open_dds(spec: BusSpec | ImuSpec, where: str) -> Any:
     _known("interface", spec.interface, ("dds", "sim"), where)
     if spec.interface == "sim":
-        return load("drivers.sim.socket_wire:SocketDdsWire")(spec.channel)
+        return load("drivers.sim.dds_port:SocketDdsWire")(spec.channel)
     try:
         return load("drivers.dds_wire:open_dds")(spec)
     except ImportError as error:

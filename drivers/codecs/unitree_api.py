@@ -54,13 +54,19 @@ def pack_response(response: Response) -> bytes:
 def unpack_request(payload: bytes) -> Request | None:
     """The request in a CDR payload; None if it is none."""
     text = _text(payload, _REQUEST.size)
-    return None if text is None else Request(*_REQUEST.unpack_from(payload, 4)[:2], text)
+    if text is None:
+        return None
+    id, number, *_ = _REQUEST.unpack_from(payload, len(CDR_HEADER))
+    return Request(id, number, text)
 
 
 def unpack_response(payload: bytes) -> Response | None:
     """The response in a CDR payload; None if it is none."""
     text = _text(payload, _RESPONSE.size)
-    return None if text is None else Response(*_RESPONSE.unpack_from(payload, 4), text)
+    if text is None:
+        return None
+    id, number, code = _RESPONSE.unpack_from(payload, len(CDR_HEADER))
+    return Response(id, number, code, text)
 
 
 def _tail(head: bytes, text: str) -> bytes:

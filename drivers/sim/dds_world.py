@@ -20,6 +20,7 @@ import numpy as np
 from drivers.bus import BusError, BusSpec, ImuSpec
 from drivers.codecs import unitree_hg as hg
 from drivers.dds_bus import StateStream
+from drivers.sim.dds_port import DdsPort
 from drivers.sim.dds_robot import SimG1, only_bus
 from drivers.sim.faults import IMU, POWER, Fault, parse_fault
 from drivers.sim.imu import ImuNoise, multiply
@@ -102,6 +103,7 @@ class DdsWorld(World):
         self.up = Link(f"{seed}/{spec.name}/up")  # from the host to the robot
         self._down = {spec.name: SimDdsWire(self, f"{seed}/{spec.name}/down"), IMU: SimDdsWire(self, f"{seed}/{IMU}")}
         self.wires = {spec.name: self._down[spec.name]}  # type: ignore[assignment]
+        self.ports = {spec.name: DdsPort(self, self._down[spec.name])}
         self.imu_wire = StateStream(self._down[IMU])  # type: ignore[assignment]
         self.latency = latency
         self._timestep = timestep
@@ -113,11 +115,11 @@ class DdsWorld(World):
         for fault in faults:
             self.inject(fault)
 
-    def send(self, topic: str, payload: bytes) -> None:
-        """A sample leaves the host."""
-        for delay, copy in self.up.pass_on(topic, payload, self.time):
+    def send(self, topic: str, payload: bytes, now: float) -> None:
+        """A sample leaves the host at ``now``."""
+        for delay, copy in self.up.pass_on(topic, payload, now):
             self._sent += 1
-            heappush(self._travelling, (self.time + self.latency + delay, self._sent, topic, copy))
+            heappush(self._travelling, (now + self.latency + delay, self._sent, topic, copy))
 
     def publish(self, topic: str, payload: bytes, time: float) -> None:
         """A sample leaves the robot, for every reader."""
@@ -210,6 +212,10 @@ class StatePublisher:
         )
         self._world.publish(hg.STATE_TOPIC, self._world.motors.state(imu, now), now)
 
+    def read(self, now: float) -> bytes:
+        """What has arrived for the IMU's reader by ``now``."""
+        return self._world.imu_wire.read()
+
 
 class SimDdsWire:
     """A host's end of a simulated domain: a drivers.wire.DdsWire."""
@@ -230,7 +236,7 @@ class SimDdsWire:
 
     def write(self, topic: str, payload: bytes) -> None:
         self._check()
-        self._world.send(topic, payload)
+        self._world.send(topic, payload, self._world.time)
 
     def read(self, topic: str) -> list[bytes]:
         self._check()

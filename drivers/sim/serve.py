@@ -1,6 +1,6 @@
 """A World as a process of its own, in real time, behind unix sockets in a directory.
 
-    <bus>.sock    SEQPACKET, datagrams of FRAME rows, both ways
+    <bus>.sock    SEQPACKET, datagrams of FRAME rows, both ways; of samples where the robot is behind DDS (dds_port.py)
     imu.sock      SEQPACKET, the bytes of the serial line
     world.sock    SEQPACKET, JSON: {"call": "push", "arguments": {...}} -> {"result": ...} or {"error": "..."}
 
@@ -29,7 +29,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -61,12 +61,32 @@ class Pace:
     unread: int = 0  # datagrams that a host did not take
 
 
+class Port(Protocol):
+    """What hosts on one socket are connected to."""
+
+    bridge: CanWire | None
+
+    def hear(self, data: bytes, now: float) -> bytes:
+        """A datagram from a host; what to answer to it alone."""
+        ...
+
+    def give(self, now: float) -> bytes:
+        """What has arrived for every host."""
+        ...
+
+
 class BusPort:
     """A bus with the hosts on it: sockets that come and go, and possibly a python-can wire."""
 
     def __init__(self, bus: SimCan, bridge: CanWire | None = None):
         self.bus, self.bridge = bus, bridge
         self._away = False
+
+    def hear(self, data: bytes, now: float) -> bytes:
+        """Rows of FRAME; anything else is dropped."""
+        if len(data) % FRAME.itemsize or (error := self.take(np.frombuffer(data, FRAME), now)) is None:
+            return b""
+        return error.tobytes()
 
     def take(self, frames: np.ndarray, now: float) -> np.ndarray | None:
         """Frames from a host; returns the error frame that a SocketCAN controller would report, or None."""
@@ -110,7 +130,8 @@ class Server:
     ):
         self.world, self.pace, self._warn = world, Pace(), warn
         bridges = bridges or {}
-        self._ports = {b.spec.name: BusPort(b, bridges.get(b.spec.name)) for b in world.buses}
+        self._ports: dict[str, Port] = {b.spec.name: BusPort(b, bridges.get(b.spec.name)) for b in world.buses}
+        self._ports |= world.ports
         self._listeners: dict[socket.socket, str] = {}
         self._clients: dict[socket.socket, str] = {}
         self._stopping = False
@@ -172,9 +193,9 @@ class Server:
                 self._clients[client] = self._listeners[sock]
             else:
                 self._hear(sock)
-        for name, port in self._ports.items():
+        for port in self._ports.values():
             if port.bridge is not None and len(frames := port.bridge.recv()):
-                self._take(name, frames)
+                port.hear(frames.tobytes(), self._now())
 
     def _follow(self, real: float, began: float) -> None:
         """Move the world on to real time, as far as it can follow."""
@@ -205,12 +226,12 @@ class Server:
             sock.close()
         elif name == "world":
             self._send(sock, self._call(data))
-        elif name != "imu" and len(data) % FRAME.itemsize == 0:
-            if (error := self._take(name, np.frombuffer(data, FRAME))) is not None:
-                self._send(sock, error.tobytes())
+        elif name != "imu" and (answer := self._ports[name].hear(data, self._now())):
+            self._send(sock, answer)
 
-    def _take(self, name: str, frames: np.ndarray) -> np.ndarray | None:
-        return self._ports[name].take(frames, max(self.world.time, time.monotonic() - self.pace.epoch))
+    def _now(self) -> float:
+        """Simulated time, as a clock has it between two substeps."""
+        return max(self.world.time, time.monotonic() - self.pace.epoch)
 
     def _flush(self) -> None:
         """Give the hosts what has arrived."""

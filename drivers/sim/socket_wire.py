@@ -37,7 +37,7 @@ def _connect(path: str, timeout: float) -> socket.socket:
     return sock
 
 
-class _Socket:
+class HostSocket:
     """A connected, non-blocking SEQPACKET socket."""
 
     def __init__(self, path: str | Path):
@@ -87,7 +87,7 @@ class SocketCanWire:
     """A drivers.wire.CanWire to the bus served at ``path``."""
 
     def __init__(self, path: str | Path):
-        self._socket = _Socket(path)
+        self._socket = HostSocket(path)
         self._away = self._full = False
 
     def send(self, frames: np.ndarray) -> None:
@@ -117,7 +117,7 @@ class SocketSerialWire:
     """A drivers.wire.SerialWire to the line served at ``path``."""
 
     def __init__(self, path: str | Path):
-        self._socket = _Socket(path)
+        self._socket = HostSocket(path)
 
     def write(self, data: bytes) -> None:
         self._socket.send(data)

@@ -42,6 +42,8 @@ class World:
     ``faults``: Faults or their text form. ``registers`` and ``wrap``: see SimMotors. ``prepare``: see Plant.
     """
 
+    ports: Mapping[str, Any] = {}  # serve.Ports of what is no CAN bus
+
     def __init__(
         self,
         model_path: str | Path,
