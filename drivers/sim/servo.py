@@ -3,7 +3,8 @@
 All servos of a bus are rows of one control table. Each is a state machine: EEPROM that is locked while torque is on,
 indirect registers, operating modes, a bus watchdog that any instruction feeds, hardware errors with their shutdown and
 reboot, a count of turns that does not survive power. Its control law runs inside the plant's integrator, in every
-substep; answers tell the state at the start of the substep in which the servo was asked.
+substep, from the moment a goal arrived on (within a substep the law is the time-weighted mean of old and new); answers
+tell the state at the start of the substep in which the servo was asked.
 
 The law is that of the codec's docstring: duty cycle from the position error by the P gain, torque from duty cycle and
 back-EMF at nominal voltage. Not modelled: D, I and feed-forward gains, profiles, the current loop's bandwidth, cogging,
@@ -99,8 +100,11 @@ class SimServos:
         self._fed = -np.inf  # s, when an instruction packet last ended
         self._booting = np.full(n, -np.inf)  # s, until when
         self._thermal_due = THERMAL_PERIOD
+        self._law = np.zeros((3, n))  # bias, kp, kd at the joints
+        self._since = np.full(n, -np.inf)  # s, when what makes the law last changed
+        self._changed = True  # the law is no longer what goals and modes make of it
+        self._settle = False  # the body still has the mean of two laws
         self._stale = True
-        self._changed = True
         self._registered: dict[int, tuple[int, bytes]] = {}  # by row, what ACTION will write
         self._body.limit(self._stall)
         for row in range(n):
@@ -323,6 +327,7 @@ class SimServos:
         if any(name == "TORQUE_ENABLE" for name, _ in names) and after[RAM] and self._shut(row):
             return StatusError.RESULT_FAIL
         self._table[row] = after
+        self._since[row] = time
         self._changed = self._stale = True
         for name, r in names:
             if name == "TORQUE_ENABLE" and bool(after[RAM]) != bool(torque):
@@ -357,7 +362,6 @@ class SimServos:
 
     def act(self, start: float, end: float) -> None:
         """Set the body's drive for the substep from ``start`` to ``end``."""
-        del end
         ticks = self._table[:, WATCHDOG]
         running = (ticks > 0) & (ticks != dynamixel.WATCHDOG_TRIPPED) & (self._table[:, RAM] > 0)
         for row in np.flatnonzero(running & (start - self._fed >= ticks * dynamixel.WATCHDOG_UNIT)):
@@ -369,8 +373,13 @@ class SimServos:
             self._warm(start)
         self._stale = True
         if self._changed:
-            self._changed = False
-            self._body.drive(*self._decide())
+            old, new = self._law, self._decide()
+            share = np.clip((end - self._since) / (end - start), 0.0, 1.0)
+            self._body.drive(*(old + share * (new - old)))
+            self._law, self._changed, self._settle = new, False, True
+        elif self._settle:
+            self._body.drive(*self._law)
+            self._settle = False
 
     def _decide(self) -> np.ndarray:
         """The law (3, n) that goals and modes make: bias, kp, kd at the joints."""
@@ -440,6 +449,7 @@ class SimServos:
             self._set(row, "GOAL_POSITION", min(r.high, max(r.low, round(float(self.position[row])))))
             if mode in DRIVEN_BY:
                 self._set(row, DRIVEN_BY[mode], 0)
+        self._since[row] = time
         self._stale = self._changed = True
         self._note(time, row, event)
 
