@@ -46,15 +46,7 @@ class Training:
         self.ppo = make_ppo(config, self.env, self.rank, self.world)
         if self.world > 1:
             self.ppo.broadcast_parameters()
-        self.iteration, self.best = 0, -1.0
-
-    @property
-    def samples(self) -> int:
-        return self.iteration * self.per_iteration
-
-    @property
-    def per_iteration(self) -> int:
-        return self.config.horizon * self.env.num_envs * self.world
+        self.iteration, self.samples, self.best = 0, 0, -1.0
 
     def run(self, report: Report = lambda row: None) -> None:
         """Until ``config.samples`` have been seen. ``report(row)`` after each iteration."""
@@ -95,6 +87,7 @@ class Training:
             ppo.compute_returns(observations)
         losses = ppo.update()
         self.iteration += 1
+        self.samples += config.horizon * env.num_envs * self.world
         return {
             "iteration": self.iteration,
             "samples": self.samples,
@@ -120,7 +113,7 @@ class Training:
             return False
         state = torch.load(path, weights_only=True)
         self.ppo.load(state["ppo"], None, strict=True)
-        self.iteration, self.best = state["iteration"], state["best"]
+        self.iteration, self.samples, self.best = state["iteration"], state["samples"], state["best"]
         self.env.load_state_dict(state["env"])
         torch.set_rng_state(state["torch_rng"])
         if self.rank > 0:  # the checkpoint holds the first process's dice: the others get their own
@@ -137,6 +130,7 @@ class Training:
         state = {
             "ppo": self.ppo.save(),
             "iteration": self.iteration,
+            "samples": self.samples,
             "best": self.best,
             "env": self.env.state_dict(),
             "torch_rng": torch.get_rng_state(),
