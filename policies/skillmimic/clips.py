@@ -1,0 +1,191 @@
+"""The clips of a run as one table: a row is a reference instant, rows are one physics step apart."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from policies import ball
+from policies.clips.format import Clip, ClipError
+from policies.clips.kinematics import rate
+from policies.clips.library import robot_clips
+from policies.clips.resample import resample
+from policies.clips.robot import POINT_NAMES, RobotBody
+from policies.contact_graph import ContactGraph, reference_edges
+from policies.skillmimic.config import SkillMimic
+from policies.skillmimic.rewards import Motion
+from policies.skillmimic.world import hands
+
+GRAVITY = 9.81  # m/s^2
+PRESS = 0.004  # m the palms start inside the ball, so that they carry it from the first step on
+
+
+class Grip(NamedTuple):
+    """What standing and holding ask of the joints beyond the clip's posture, each (T, n) rad."""
+
+    press: np.ndarray  # to be added to positions: both palms ``PRESS`` into the ball
+    effort: np.ndarray  # to be added to targets: static torque over kp
+
+
+class ReferenceClips:
+    """Every clip of ``config.skills``, end to end.
+
+    ``first`` and ``length`` (clips,): rows of each; ``skill`` (clips,) its label's index; ``swing`` (clips,) whether it
+    plays to and fro. ``qpos`` (rows, 7 + n + 7), ``qvel`` (rows, 6 + n + 6) and ``target`` (rows, n) start an episode.
+    """
+
+    def __init__(
+        self, config: SkillMimic, model: mujoco.MjModel, body: RobotBody, graph: ContactGraph, kp: np.ndarray
+    ) -> None:
+        clips: list[Clip] = []
+        labels: list[int] = []
+        for k, skill in enumerate(config.skills):
+            found = [c for c in robot_clips(config.robot, skill) if not config.clips or c.name in config.clips]
+            if not found:
+                raise ClipError(f"skill '{skill}': none of its clips is in {', '.join(config.clips)}, expected one")
+            clips += found
+            labels += [k] * len(found)
+        for clip in clips:
+            _check(clip, body)
+        fine = [resample(clip, 1 / config.timestep) for clip in clips]
+        self.names = [clip.name for clip in clips]
+        self.length = np.array([len(c) for c in fine])
+        self.first = np.cumsum([0, *self.length[:-1]])
+        self.skill = np.array(labels)
+        self.swing = np.array([config.skills[k] in config.swing for k in labels])
+        self._motion = _concatenate([_motion(c, graph, hands(body)) for c in fine])
+        rows = [_resampled(grip(c, model, body, kp, config.grip), len(f)) for c, f in zip(clips, fine, strict=True)]
+        press, effort = (np.concatenate([r[i] for r in rows]) for i in (0, 1))
+        m = self._motion
+        count = len(press)
+        joints = m.joint_pos + press
+        upright = np.tile([1.0, 0, 0, 0], (count, 1))
+        self.qpos = np.concatenate([m.points[:, 0], m.orientation_base_in_world, joints, m.object_position, upright], 1)
+        spin = np.concatenate([c.base_angular_velocity_in_base for c in fine])
+        self.qvel = np.concatenate(
+            [m.points_velocity[:, 0], spin, m.joint_vel, m.object_velocity, np.zeros((count, 3))], axis=1
+        )
+        self.target = joints + effort
+
+    def sample(self, rng: np.random.Generator, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """(k,) clips and (k,) rows into them: every skill as often, then every clip of it, then every instant."""
+        skills = rng.integers(self.skill.max() + 1, size=k)
+        counts = np.bincount(self.skill)
+        first = np.searchsorted(self.skill, np.arange(len(counts)))
+        clip = first[skills] + np.floor(rng.random(k) * counts[skills]).astype(int)
+        last = self.length[clip] - np.where(self.swing[clip], 0, self.length[clip] // 10)  # leave something to do
+        return clip, np.floor(rng.random(k) * last).astype(int)
+
+    def rows(self, clip: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Table rows (N,) of ``row`` (N,) steps into ``clip`` (N,), and which way time runs there: 1 or -1.
+
+        A swinging clip turns at both ends; another stays at its last row.
+        """
+        last = self.length[clip] - 1
+        around = np.mod(row, 2 * last)
+        back = self.swing[clip] & (around > last)
+        row = np.where(self.swing[clip], np.where(back, 2 * last - around, around), np.minimum(row, last))
+        return self.first[clip] + row, np.where(back, -1.0, 1.0)
+
+    def motion(self, rows: np.ndarray, way: np.ndarray) -> Motion:
+        """The reference at table ``rows`` (N,), with velocities in the direction ``way`` (N,)."""
+        m = Motion(*(array[rows] for array in self._motion))
+        return m._replace(
+            points_velocity=m.points_velocity * way[:, None, None],
+            joint_vel=m.joint_vel * way[:, None],
+            object_velocity=m.object_velocity * way[:, None],
+        )
+
+    def mean(self, skill: int) -> tuple[np.ndarray, np.ndarray]:
+        """Of one skill, every clip counting alike: mean target (n,) rad, and mean gravity in the base (3,)."""
+        chosen = np.flatnonzero(self.skill == skill)
+        pieces = [slice(self.first[c], self.first[c] + self.length[c]) for c in chosen]
+        w, x, y, z = self._motion.orientation_base_in_world.T
+        gravity = np.stack([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1], axis=1)
+        posture, down = (np.mean([a[p].mean(axis=0) for p in pieces], axis=0) for a in (self.target, gravity))
+        return posture, down
+
+
+def grip(clip: Clip, model: mujoco.MjModel, body: RobotBody, kp: np.ndarray, force: float) -> Grip:
+    """Statics of every frame: the robot's weight on the standing feet, and the ball's on the holding palms, which press
+    it with ``force`` N each where both are on it."""
+    data = mujoco.MjData(model)
+    arms = np.array([j.group == "arm" for j in body.robot.joints])
+    robot = model.body(body.robot.base).id
+    palms, feet = (list(zip(ids, model.site_bodyid[ids], strict=True)) for ids in (body.palms, body.feet))
+    press, effort = np.zeros((2, len(clip), len(arms)))
+    for t in range(len(clip)):
+        data.qpos[:3], data.qpos[3:7] = clip.base_position_in_world[t], clip.base_orientation_in_world[t]
+        data.qpos[7:-7], data.qpos[-7:-4] = clip.joint_pos[t], clip.ball_position_in_world[t]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_rne(model, data, 0, data.qfrc_bias)
+        torque = data.qfrc_bias[6:-6].copy()
+        mass, centre = float(model.body_subtreemass[robot]), data.subtree_com[robot].copy()
+        holding = [palm for palm, on in zip(palms, clip.contact[t, :2], strict=True) if on]
+        standing = [foot for foot, on in zip(feet, clip.contact[t, 2:], strict=True) if on]
+        for site, link in holding:
+            towards = clip.ball_position_in_world[t] - data.site_xpos[site]
+            towards /= np.linalg.norm(towards)
+            jacobian = _jacobian(model, data, data.site_xpos[site], link)
+            if len(holding) == 2:
+                torque += jacobian.T @ (force * towards)
+                press[t] += np.linalg.pinv(jacobian * arms, rcond=1e-2) @ (PRESS * towards)
+            torque += jacobian.T @ [0, 0, -ball.MASS * GRAVITY / len(holding)]
+        if holding:
+            centre = (mass * centre + ball.MASS * clip.ball_position_in_world[t]) / (mass + ball.MASS)
+            mass += ball.MASS
+        if standing:  # pressure below the centre of mass
+            off = centre - np.mean([data.site_xpos[site] for site, _ in standing], axis=0)
+            for site, link in standing:
+                point = data.site_xpos[site] + [off[0], off[1], 0]
+                torque -= _jacobian(model, data, point, link).T @ [0, 0, mass * GRAVITY / len(standing)]
+        legs = np.array([j.group == "leg" for j in body.robot.joints])
+        effort[t] = np.where(legs & (not standing), 0.0, torque / kp)
+    return Grip(press, effort)
+
+
+def _jacobian(model: mujoco.MjModel, data: mujoco.MjData, point: np.ndarray, link: int) -> np.ndarray:
+    """(3, n) of a point (3,) m in the world on a body, by the robot's joints."""
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jac(model, data, jacobian, None, np.asarray(point, float), int(link))
+    return jacobian[:, 6:-6]
+
+
+def _check(clip: Clip, body: RobotBody) -> None:
+    header = clip.header
+    if header.joint_names != body.robot.joint_names or header.point_names != POINT_NAMES:
+        raise ClipError(
+            f"clip '{clip.name}': made for other joints or key points than {body.robot.name} has now;"
+            f" make it again: sim2real clips retarget --library --robot {body.robot.name}"
+        )
+    if not header.has_ball:
+        raise ClipError(
+            f"clip '{clip.name}': has no ball, expected one; ball skills are learned from clips with a ball"
+        )
+
+
+def _motion(clip: Clip, graph: ContactGraph, palms: tuple[str, ...]) -> Motion:
+    points = np.concatenate([clip.base_position_in_world[:, None], clip.points_in_world], axis=1)
+    return Motion(
+        points=points,
+        points_velocity=rate(points, clip.fps),
+        orientation_base_in_world=clip.base_orientation_in_world,
+        joint_pos=clip.joint_pos,
+        joint_vel=clip.joint_vel,
+        object_position=clip.ball_position_in_world,
+        object_velocity=clip.ball_velocity_in_world,
+        contact=reference_edges(graph, clip.contact[:, :2], "ball", palms).astype(float),
+    )
+
+
+def _concatenate(motions: list[Motion]) -> Motion:
+    return Motion(*(np.concatenate(arrays) for arrays in zip(*motions, strict=True)))
+
+
+def _resampled(g: Grip, rows: int) -> Grip:
+    """The same over ``rows`` rows, nearest frame."""
+    at = np.round(np.linspace(0, len(g.press) - 1, rows)).astype(int)
+    return Grip(g.press[at], g.effort[at])

@@ -1,0 +1,74 @@
+"""Settings of a SkillMimic run, written beside its checkpoints. Everything to tune is here or in a table of this package."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class SkillMimic:
+    """One run. A skill is a label of ``policies/<robot>/clips``; more skills are more labels, with the same settings."""
+
+    robot: str = "g1"
+    seed: int = 1
+    envs: int = 512
+    threads: int = 2  # of the physics; the networks have one more
+    # what is learned
+    skills: tuple[str, ...] = ("hold",)
+    clips: tuple[str, ...] = ("hold_05",)  # only these of them, by name; none: all
+    swing: tuple[str, ...] = ("hold",)  # skills whose clips play to and fro; the others' end ends the episode
+    variant: str = "skillmimic"  # see rewards.VARIANTS
+    sensitivity: str = "robot"  # see rewards.SENSITIVITIES
+    # the policy
+    period: float = (
+        0.02  # s: 50 Hz, against the paper's 60; retargeted clips are slower by the root of the length scale
+    )
+    hidden: tuple[int, ...] = (256, 128)
+    action_ratio: float = 0.25  # action 1 moves the target by this share of torque / kp
+    action_max: float = 6.0
+    grip: float = (
+        25.0  # N each palm presses, where the clip has both on the ball: inside the posture actions start from
+    )
+    balance_gain: float = 2.3  # rad of ankle per rad of pitch away from the skill's own; 0 for skills that walk
+    balance_damping: float = 0.25  # rad per rad/s
+    position_margin: float = 0.05  # rad inside the mechanical range; wider than the safety gate's
+    history: int = 3  # past ticks seen beside the present one
+    # the world
+    timestep: float = 0.005  # s of the physics
+    frames: int = 60  # ticks in an episode, as in the paper: 1.2 s here, 1.4 s of the recorded motion
+    disturbed: float = 0.5  # share of episodes that start beside their reference frame
+    push_chance: float = 0.01  # a tick
+    push_speed: float = 0.3  # m/s, the largest
+    terminations: tuple[str, ...] = ("fallen", "tilted", "ball_lost", "broken")
+    # the learner
+    horizon: int = 24  # ticks per iteration
+    learning_rate: float = 5e-4  # at the start; then the step size is what keeps the KL divergence at desired_kl
+    samples: float = 20e6
+    gamma: float = 0.98
+    std: float = 0.25  # of the actions at the start
+    ppo: dict[str, float | int | str | bool] = field(
+        default_factory=lambda: {
+            "num_learning_epochs": 4,
+            "num_mini_batches": 6,
+            "clip_param": 0.2,
+            "lam": 0.95,
+            "value_loss_coef": 1.0,
+            "entropy_coef": 0.002,
+            "max_grad_norm": 1.0,
+            "schedule": "adaptive",  # safe here: observations have fixed scales, no running normaliser to drift
+            "desired_kl": 0.012,
+            "use_clipped_value_loss": False,
+        }
+    )
+    # checkpoints and evaluation, in iterations
+    save_every: int = 100
+    evaluate_every: int = 50
+    evaluate_envs: int = 64
+    evaluate_seconds: float = 10.0
+
+
+TASKS: dict[str, SkillMimic] = {
+    "g1-hold": SkillMimic(),
+    "g1-ball": SkillMimic(clips=(), skills=("hold", "raise", "carry", "pass", "catch", "pickup"), balance_gain=0.0,
+                          balance_damping=0.0, samples=100e6),
+}  # fmt: skip

@@ -1,0 +1,292 @@
+"""The training environment: many robots with a ball on ``mujoco.batch``, numpy inside, torch at the border (rsl_rl).
+
+Rewards are given for the instant one physics step before the end of a period: there MuJoCo's positions, contacts and
+forces belong together without another pass, and the reference table has a row for it.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import Batch
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+from torch import Tensor
+
+from policies.clips.kinematics import conjugate, multiply, quaternion_from_rotation_vector, rotate
+from policies.clips.robot import POINT_NAMES, RobotBody
+from policies.env import POSITION_STEP, VELOCITY_STEP
+from policies.graph import one_hot
+from policies.skillmimic.config import SkillMimic
+from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.observations import observe
+from policies.skillmimic.randomisation import LOSS_TICKS, Randomisation
+from policies.skillmimic.rewards import SENSITIVITIES, Motion, Step, reward
+from policies.skillmimic.terminations import failed
+
+BASE, JOINTS, BALL = slice(0, 7), slice(7, -7), slice(-7, -4)  # of qpos
+SPIN, RATES, FLIGHT = slice(3, 6), slice(6, -6), slice(-6, -3)  # of qvel
+
+
+class Env(VecEnv):
+    """One policy period per step, ``config.envs`` robots, each somewhere inside some clip of some skill.
+
+    An episode lasts ``config.frames`` ticks; of a clip that does not swing, at most to its end.
+    """
+
+    level = None  # no push curriculum here
+
+    def __init__(self, config: SkillMimic, seed: int, graph: PolicyGraph | None = None) -> None:
+        self.cfg = self.config = config
+        self.device = "cpu"
+        self.graph = graph or PolicyGraph(config)
+        self.model, self.contacts, self.clips = self.graph.model, self.graph.contact_graph, self.graph.clips
+        self.sensitivity = SENSITIVITIES[config.sensitivity]
+        self.rng = np.random.default_rng(seed)
+        self.num_envs = n = config.envs
+        self.num_actions = joints = len(self.graph.joint_names)
+        self.max_episode_length = config.frames
+        self.episode_length_buf = torch.zeros(n, dtype=torch.long)
+        self.substeps = round(config.period / config.timestep)
+        self.batch = Batch(self.model, n, config.threads)
+        self.random = Randomisation(self.batch, self.model)
+        self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
+        self._anchors, self._sites = self.batch.bind("xanchor"), self.batch.bind("site_xpos")
+        self._place = _point_columns(self.graph.body)
+        self._recorded: dict = {
+            "qpos": np.zeros((n, self.substeps, self.model.nq)),
+            "qvel": np.zeros((n, self.substeps, self.model.nv)),
+            "sensordata": np.zeros((n, self.substeps, self.model.nsensordata)),
+        }
+        self.clip, self.row = np.zeros(n, np.intp), np.zeros(n, np.intp)  # what is imitated, and how far it is
+        self.skill = torch.zeros(n, len(self.graph.labels))
+        self.action, self.target = torch.zeros(n, joints), torch.zeros(n, joints)
+        self.history = torch.zeros(n, self.graph.history)
+        self._seen = np.zeros((n, 6))  # the tracker's last answer
+        self._lost = np.zeros(n, np.int64)  # ticks until it sees the ball again
+        self._last_points = np.zeros((n, self._place.shape[0] + 1, 3))
+        self._last_joint_vel = np.zeros((n, joints))
+        self.observation, self.privileged = torch.zeros(0), torch.zeros(0)
+        self.terms: dict[str, np.ndarray] = {}  # sub-rewards of the last step
+        self.failures = np.zeros(n, bool)
+        self.reset()
+
+    # rsl_rl's side
+
+    def get_observations(self) -> TensorDict:
+        groups = {"policy": self.observation, "privileged": self.privileged}
+        return TensorDict(groups, batch_size=[self.num_envs])  # type: ignore[arg-type]
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
+        """``actions`` (envs, n) -> observations, rewards (envs,), dones (envs,), extras. Failed and finished episodes
+        start anew; the observation returned is then the new episode's first."""
+        last_action = self.action
+        self._act(actions.detach())
+        self.now = now = self._judge((self.action - last_action).numpy())
+        rewards, self.terms = reward(now, self.config.variant, self.sensitivity)
+        self.failures = failed(now, self.config.terminations)
+        rewards[~np.isfinite(rewards)] = 0.0
+        self.episode_length_buf += 1
+        over = self.episode_length_buf.numpy() >= self.max_episode_length
+        over |= ~self.clips.swing[self.clip] & (self.row >= self.clips.length[self.clip] - 1)
+        timeouts = over & ~self.failures
+        self._push()
+        self._start(np.flatnonzero(over | self.failures))
+        self._observe()
+        extras = {"time_outs": torch.from_numpy(timeouts), "observations": {}}
+        dones = torch.from_numpy((over | self.failures).astype(np.int64))
+        return self.get_observations(), torch.from_numpy(rewards.astype(np.float32)), dones, extras
+
+    def reset(self) -> None:
+        """Start every episode anew."""
+        self._start(np.arange(self.num_envs))
+        ages = self.rng.integers(self.max_episode_length, size=self.num_envs)  # so that they do not all end together
+        self.episode_length_buf = torch.from_numpy(ages)
+        self._observe()
+
+    def state_dict(self) -> dict:
+        """What a resumed run needs; call ``reset`` on both sides of a checkpoint and they continue alike."""
+        return {"rng": self.rng.bit_generator.state}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.rng.bit_generator.state = state["rng"]
+        self.reset()
+
+    # one policy period
+
+    def _act(self, action: Tensor) -> None:
+        """Send the action's targets, late by each robot's delay, and let the physics run."""
+        before = self.target.numpy()
+        self.action = self.graph.clip(action)
+        self.target = self.graph.target(self.measured, self.action)
+        self.history = self.graph.remember(self.measured)
+        delay = np.floor(self.random.drawn["action_delay"][:, 0])
+        delay += self.rng.random(self.num_envs) < self.random.drawn["jitter"][:, 0]
+        late = np.arange(self.substeps)[None, :, None] < delay[:, None, None]
+        control = np.where(late, before[:, None], self.target.numpy()[:, None]).astype(np.float64)
+        self._recorded = self.batch.rollout(
+            self.substeps,
+            control,
+            int(mujoco.mjtState.mjSTATE_CTRL),
+            record=("qpos", "qvel", "sensordata"),
+            out=self._recorded,
+        )
+        self.row += self.substeps
+
+    def _judge(self, action_change: np.ndarray) -> Step:
+        """The state and its reference, one physics step before now."""
+        qpos, qvel = self._recorded["qpos"][:, -2], self._recorded["qvel"][:, -2]
+        derived = np.concatenate([self._anchors, self._sites], axis=1)
+        points = np.concatenate([qpos[:, None, :3], derived[:, self._place]], axis=1)
+        touched = self.contacts.touching(self._recorded["sensordata"]).any(axis=1)
+        state = Motion(
+            points=points,
+            points_velocity=(points - self._last_points) / self.config.period,
+            orientation_base_in_world=qpos[:, 3:7],
+            joint_pos=qpos[:, JOINTS],
+            joint_vel=qvel[:, RATES],
+            object_position=qpos[:, BALL],
+            object_velocity=qvel[:, FLIGHT],
+            contact=touched.astype(float),
+        )
+        reference = self.clips.motion(*self.clips.rows(self.clip, self.row - 1))
+        acceleration = (state.joint_vel - self._last_joint_vel) / self.config.period
+        self._last_points, self._last_joint_vel = points, state.joint_vel.copy()
+        return Step(state, reference, acceleration, action_change)
+
+    def _observe(self) -> None:
+        """Measure every robot; what its actor sees this tick, and what only the critic sees."""
+        n, rng, drawn = self.num_envs, self.rng, self.random.drawn
+        newest = self.substeps - 1 - np.floor(drawn["state_delay"][:, 0]).astype(int)
+        qpos, qvel = (self._recorded[f][np.arange(n), newest] for f in ("qpos", "qvel"))
+        joints = self.model.nu
+        noise = lambda name, size: drawn[name] * rng.standard_normal((n, size))  # noqa: E731
+        joint_pos = qpos[:, JOINTS] + drawn["joint_offset"] + noise("joint_pos_noise", joints)
+        joint_vel = qvel[:, RATES] + noise("joint_vel_noise", joints)
+        gyro = qvel[:, SPIN] + noise("gyro_noise", 3)
+        tilt = drawn["imu_tilt"] + noise("gravity_noise", 2)
+        orientation = multiply(qpos[:, 3:7], np.column_stack([np.ones(n), tilt / 2, np.zeros(n)]))
+        orientation /= np.linalg.norm(orientation, axis=1, keepdims=True)
+        seen = self._track()
+        inputs = {
+            "joint_pos": _tensor(np.round(joint_pos / POSITION_STEP) * POSITION_STEP),
+            "joint_vel": _tensor(np.round(joint_vel / VELOCITY_STEP) * VELOCITY_STEP),
+            "orientation_base_in_world": _tensor(orientation),
+            "angular_velocity_base_in_base": _tensor(gyro),
+            "skill": self.skill.clone(),
+            "object_position_in_base": _tensor(seen[:, :3]),
+            "object_velocity_in_base": _tensor(seen[:, 3:]),
+        }
+        self.inputs = inputs
+        self.carries = {"carry_action": self.action, "carry_history": self.history}
+        self.measured = self.graph.signals(*inputs.values(), *self.carries.values())
+        self.observation = observe(self.measured)
+        self.privileged = _tensor(self._truth())
+
+    def _track(self) -> np.ndarray:
+        """(envs, 6) object_position_in_base and object_velocity_in_base as a tracker tells them."""
+        n, rng, drawn = self.num_envs, self.rng, self.random.drawn
+        newest = self.substeps - 1 - np.floor(drawn["object_delay"][:, 0]).astype(int)
+        qpos, qvel = (self._recorded[f][np.arange(n), newest] for f in ("qpos", "qvel"))
+        back = conjugate(qpos[:, 3:7])
+        position = rotate(back, qpos[:, BALL] - qpos[:, :3]) + drawn["object_offset"]
+        position += drawn["object_noise"] * rng.standard_normal((n, 3))
+        velocity = rotate(back, qvel[:, FLIGHT] - qvel[:, :3])
+        velocity += drawn["object_velocity_noise"] * rng.standard_normal((n, 3))
+        out_of_sight = (self._lost == 0) & (rng.random(n) < drawn["object_loss"][:, 0])
+        self._lost[out_of_sight] = rng.integers(*LOSS_TICKS, size=int(out_of_sight.sum()), endpoint=True)
+        sees = self._lost == 0
+        self._seen[sees] = np.concatenate([position, velocity], axis=1)[sees]
+        self._lost[~sees] -= 1
+        return self._seen
+
+    def _truth(self) -> np.ndarray:
+        """(envs, size): what the critic may know beside the actor's observation; about 1 in size."""
+        qpos, qvel = self._qpos, self._qvel
+        rows, way = self.clips.rows(self.clip, self.row)
+        reference = self.clips.motion(rows, way)
+        back = conjugate(qpos[:, 3:7])
+        turn = multiply(back, reference.orientation_base_in_world)
+        ahead = self.episode_length_buf.numpy()[:, None] / self.max_episode_length
+        left = (self.clips.length[self.clip] - self.row)[:, None] / 200.0
+        columns = [
+            rotate(back, qvel[:, :3]),
+            rotate(back, reference.points[:, 0] - qpos[:, :3]) * 4,
+            turn[:, 1:] * np.where(turn[:, :1] < 0, -4, 4),
+            (reference.joint_pos - qpos[:, JOINTS]) * 2,
+            reference.joint_vel * 0.3,
+            rotate(back, qpos[:, BALL] - qpos[:, :3]) * 4,
+            rotate(back, qvel[:, FLIGHT] - qvel[:, :3]) * 0.5,
+            rotate(back, reference.object_position - qpos[:, BALL]) * 4,
+            rotate(back, reference.object_velocity) * 0.5,
+            np.minimum(self.contacts.force(self._recorded["sensordata"][:, -1]) / 20.0, 3.0),
+            reference.contact,
+            qpos[:, 2:3],
+            ahead,
+            np.where(self.clips.swing[self.clip][:, None], 1.0, np.minimum(left, 1.0)),
+            self.random.vector(),
+        ]
+        return np.clip(np.concatenate(columns, axis=1), -10, 10)
+
+    # between periods
+
+    def _push(self) -> None:
+        config, rng = self.config, self.rng
+        now = np.flatnonzero(rng.random(self.num_envs) < config.push_chance)
+        heading, speed = rng.uniform(-np.pi, np.pi, len(now)), rng.uniform(0, config.push_speed, len(now))
+        self._qvel[now, 0] += speed * np.cos(heading)
+        self._qvel[now, 1] += speed * np.sin(heading)
+
+    def _start(self, ids: np.ndarray) -> None:
+        """New episodes in ``ids``: reference state initialisation (section 5.2), some of it disturbed."""
+        if len(ids) == 0:
+            return
+        rng, k = self.rng, len(ids)
+        self.random.draw(ids, rng)
+        self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        self.clip[ids], self.row[ids] = self.clips.sample(rng, k)
+        rows, _ = self.clips.rows(self.clip[ids], self.row[ids])
+        qpos, qvel = self.clips.qpos[rows].copy(), self.clips.qvel[rows].copy()
+        self._disturb(qpos, qvel, rng.random(k) < self.config.disturbed)
+        self._qpos[ids], self._qvel[ids] = qpos, qvel
+        self._recorded["qpos"][ids], self._recorded["qvel"][ids] = qpos[:, None], qvel[:, None]
+        self._recorded["sensordata"][ids] = 0.0
+        self.skill[ids] = one_hot(self.clips.skill[self.clip[ids]], len(self.graph.labels))
+        self.target[ids] = _tensor(self.clips.target[rows])
+        self.action[ids], self.history[ids] = 0.0, 0.0
+        self._lost[ids] = 0
+        self._last_points[ids] = self.clips.motion(rows, np.ones(k)).points
+        self._last_joint_vel[ids] = qvel[:, RATES]
+        self.episode_length_buf[ids] = 0
+
+    def _disturb(self, qpos: np.ndarray, qvel: np.ndarray, chosen: np.ndarray) -> None:
+        """Move the starts ``chosen`` (k,) bool beside their reference, in place: all of the robot, with the ball."""
+        rng, k, w = self.rng, len(qpos), chosen[:, None]
+        qpos[:, JOINTS] += w * rng.uniform(-0.05, 0.05, (k, self.model.nu))
+        qpos[:, JOINTS] = np.clip(qpos[:, JOINTS], *self.model.jnt_range[1:-1].T)
+        turn = quaternion_from_rotation_vector(w * rng.uniform(-0.04, 0.04, (k, 3)))
+        arm = qpos[:, BALL] - qpos[:, :3]  # the ball turns with the robot, so it stays in the hands
+        qpos[:, 3:7] = multiply(turn, qpos[:, 3:7])
+        qpos[:, BALL] = qpos[:, :3] + rotate(turn, arm)
+        up = w * rng.uniform(0.0, 0.01, (k, 1))
+        qpos[:, 2:3] += up
+        qpos[:, -5:-4] += up
+        qpos[:, BALL] += w * rng.uniform(-0.004, 0.004, (k, 3))
+        shift = w * rng.uniform(-0.15, 0.15, (k, 3))
+        qvel[:, :3] += shift
+        qvel[:, FLIGHT] += shift
+        qvel[:, RATES] += w * rng.uniform(-0.2, 0.2, (k, self.model.nu))
+
+
+def _point_columns(body: RobotBody) -> np.ndarray:
+    """(points,) where the key points of a clip are in joint anchors followed by site positions."""
+    joints = body.model.njnt + 1  # and the ball's free joint, after the robot's
+    place = dict(body.joint_ids)
+    for k, side in enumerate(("left", "right")):
+        place[f"{side}_palm"], place[f"{side}_foot"] = joints + int(body.palms[k]), joints + int(body.feet[k])
+    return np.array([place[name] for name in POINT_NAMES])
+
+
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(values.astype(np.float32))

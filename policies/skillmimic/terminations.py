@@ -1,0 +1,40 @@
+"""When an episode has failed. The released code knows only the first; a run chooses by ``config.terminations``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from policies.skillmimic.rewards import Step
+
+BALL_LOST = 0.3  # m between ball and its reference, seen from the base, while the reference has it in hand
+FALLEN = 0.3  # m: the base; the retargeted pickup bends down to 0.48
+
+
+def up(orientation_base_in_world: np.ndarray) -> np.ndarray:
+    """(N,) cosine of the tilt, from quaternions (N, 4)."""
+    _, x, y, _ = orientation_base_in_world.T
+    return 1 - 2 * (x * x + y * y)
+
+
+def _ball_lost(s: Step) -> np.ndarray:
+    here, there = (m.object_position - m.points[:, 0] for m in (s.state, s.reference))
+    return (s.reference.contact[:, 0] > 0) & (np.linalg.norm(here - there, axis=1) > BALL_LOST)
+
+
+TERMINATIONS: dict[str, Callable[[Step], np.ndarray]] = {
+    "fallen": lambda s: s.state.points[:, 0, 2] < FALLEN,
+    # 0.6 rad more than the reference leans; a bending pickup leans too
+    "tilted": lambda s: (
+        np.arccos(np.clip(up(s.state.orientation_base_in_world), -1, 1))
+        > np.arccos(np.clip(up(s.reference.orientation_base_in_world), -1, 1)) + 0.6
+    ),
+    "ball_lost": _ball_lost,
+    "broken": lambda s: ~np.isfinite(s.state.joint_vel).all(axis=1) | (np.abs(s.state.joint_vel).max(axis=1) > 60.0),
+}
+
+
+def failed(s: Step, chosen: Sequence[str]) -> np.ndarray:
+    """(N,) bool."""
+    return np.logical_or.reduce([TERMINATIONS[name](s) for name in chosen])
