@@ -9,7 +9,8 @@ import numpy as np
 from sim_robots import make_world
 
 from drivers.bus import BusSpec, MotorCommand, MotorSpec, MotorState
-from drivers.open import open_bus
+from drivers.codecs.mini_cheetah import CYCLE
+from drivers.open import PROTOCOLS, open_bus
 from drivers.sim.world import World
 
 # Protocol: the model and the identifiers (id, feedback_id) of the motors of the rig.
@@ -17,6 +18,16 @@ RIGS: dict[str, tuple[str, list[tuple[int, int]]]] = {
     "damiao": ("DM8006", [(1, 0x11), (2, 0x12)]),
     "robstride": ("RS03", [(1, 0), (0x7F, 0)]),
     "recoil": ("6512", [(1, 0), (63, 0)]),
+    "mini_cheetah": ("mini-cheetah", [(1, 0), (0xFF, 0)]),
+    "cubemars": ("AK80-9", [(1, 0), (2, 0)]),
+    "robstride_mit": ("RS02", [(1, 0), (0x7F, 0)]),
+}
+WATCHDOG = 0.05  # s
+# Where connecting cannot program it: what the motor was set to before, by serial line.
+SET_BEFORE = {
+    name: {joint: {"TIMEOUT": WATCHDOG / CYCLE} for joint in ("left", "right")}
+    for name, protocol in PROTOCOLS.items()
+    if not protocol.watchdog
 }
 RATE = 250.0  # Hz
 
@@ -24,7 +35,11 @@ RATE = 250.0  # Hz
 def rig(protocol: str, **changes: Any) -> BusSpec:
     model, ids = RIGS[protocol]
     motors = tuple(MotorSpec(joint, model, *id) for joint, id in zip(("left", "right"), ids, strict=True))
-    return BusSpec(**{"name": "arm", "protocol": protocol, "motors": motors, "watchdog": 0.05} | changes)
+    return BusSpec(
+        **{"name": "arm", "protocol": protocol, "motors": motors}
+        | {"watchdog": WATCHDOG * PROTOCOLS[protocol].watchdog}
+        | changes
+    )
 
 
 class WorldClock:
