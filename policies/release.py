@@ -20,6 +20,9 @@ from sim2real.config import load_robot
 from sim2real.policy import Policy
 
 GOLDEN_STEPS = 40  # policy ticks of each golden sequence, with two skill switches
+# Below this the policy refuses a switch. Measured on this task: undisturbed robots score 0.7 to 1.1 (1 % of them less),
+# robots that are on the ground half a second later -0.05 to 0.25.
+VALUE_MIN = 0.5
 SETTLED = 100  # ticks after which an undisturbed episode counts as healthy
 
 
@@ -41,7 +44,10 @@ def release(folder: Path, path: Path, checkpoint: str = "best.pt") -> Policy:
         "kp": robot.home_kp.tolist(),
         "kd": robot.home_kd.tolist(),
         "action_scale": graph.scale.tolist(),
-        "skills": [{"label": label, "description": m.description} for label, m in MOTIONS.items()],
+        "skills": [  # to stand still is always allowed
+            {"label": label, "description": m.description, "value_min": VALUE_MIN if k else None}
+            for k, (label, m) in enumerate(MOTIONS.items())
+        ],
         "default_skill": graph.labels[0],
         "history": "none: the only memory is carry_*",
         "envelope": envelope(training_signals(graph)),
