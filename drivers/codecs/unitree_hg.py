@@ -207,9 +207,10 @@ _PADDING_MASK = np.array([0xFFFF] + [0xFF] * SLOTS, np.uint32)
 class UnitreeHgCodec:
     """The host's side: LowCmd for the motors of one bus, and what a LowState says of them."""
 
-    # Bits on the Ethernet for each of 29 motors: a LowCmd (1004 bytes) and a LowState (2092, in two packets) with RTPS,
-    # UDP, IP and Ethernet around them (about 150 bytes a packet).
-    TICK_BITS = ((1004 + 2092 + 3 * 150) * 8 / len(JOINTS),) * 2
+    # Bits on the Ethernet: a LowCmd (1004 bytes) and a LowState (2092, in two packets), with RTPS, UDP, IP and Ethernet
+    # around them (about 150 bytes a packet). However many motors are used, all 35 slots are there.
+    TICK_BITS = (0.0, 0.0)
+    TICK_OVERHEAD_BITS = (1004 + 2092 + 3 * 150) * 8.0
     TICK_FRAMES = 2  # one sample each way
 
     def __init__(self, spec: BusSpec) -> None:
