@@ -84,5 +84,7 @@ def run(tuned: bool) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         path = Path(directory) / "run.mcap"
         summary = deploy(*standing(SECONDS), *([] if tuned else ["--untuned"]), record=path)
         tick, pilot = Reader(path)["/tick"], Reader(path)["/pilot"]
+        if not len(pilot) or not (pilot["stage"] == Stage.RUN).any():
+            raise Sim2realError(f"the robot never performed: {' '.join(summary['messages'][-1:])}")
         armed, performing = tick["mode"] == Mode.RUN, pilot["stage"] == Stage.RUN
         return summary, {"/tick": tick["timing.lateness"][armed], "/pilot": pilot["timing.lateness"][performing]}
