@@ -187,6 +187,7 @@ class Launch:
         running: float | None = None
         asked: float | None = None
         guardian = self.children["guardian"].process
+        hanging = self.gantry
         n = 0
         while guardian.poll() is None:
             schedule.wait()
@@ -203,8 +204,8 @@ class Launch:
                 self._wish["quit"] = 1
             self._wishes.write(self._wish)
             if self.world is not None:
-                if self.gantry:
-                    support(self.world, self.stage, self._engage_left(now), self.since)
+                if hanging:
+                    hanging = support(self.world, self.stage, self._engage_left(now), self.since)
                 self.measures.observe(self.world, self.states.record, self.pilot_states.record, self.since)
             self.measures.tick(self.states.record)
             self._listen()

@@ -114,6 +114,7 @@ class Simulation:
         began = self.clock.now()
         running: float | None = None
         pushes = list(self.scene.pushes)
+        hanging = self.scene.gantry
         while not self.guardian.done:
             due = self.schedule.wait()
             now = self.clock.now()
@@ -121,8 +122,8 @@ class Simulation:
             if running is None and stage == Stage.RUN:
                 running = now
             self.since = now - running if running is not None else -1.0
-            if self.scene.gantry:
-                support(world, stage, self.player.engage_left(now), self.since)
+            if hanging:
+                hanging = support(world, stage, self.player.engage_left(now), self.since)
             while pushes and 0 <= pushes[0][0] <= self.since:
                 world.push(pushes.pop(0)[1])
             store(self.operator.read(now, self.since), self.player.labels, self._operator_record)
@@ -149,12 +150,14 @@ class Simulation:
         return summary
 
 
-def support(crane, stage: Stage, left: float, since: float) -> None:
+def support(crane, stage: Stage, left: float, since: float) -> bool:
     """What the person at the crane does: in the last of the soft start (``left`` s) sets the robot on its feet without
-    giving it all its weight, and lets go once the policy has had it for a moment (``since`` s)."""
+    giving it all its weight, and lets go once the policy has had it for a moment (``since`` s). Returns whether there is
+    still something to do."""
     if stage == Stage.ENGAGE and left < LOWERING:
         crane.lower()
     elif since > LETTING_GO:
         crane.release()
     elif since >= 0:
         crane.hold()
+    return since <= LETTING_GO
