@@ -35,6 +35,7 @@ PROTOCOLS: dict[str, BusProtocol] = {
     "mini_cheetah": _can("mini_cheetah", "MiniCheetah", watchdog=False),
     "cubemars": _can("cubemars", "Cubemars", watchdog=False),
     "robstride_mit": _can("robstride_mit", "RobstrideMit", watchdog=False),
+    "odrive": _can("odrive", "Odrive", watchdog=False),
     "dynamixel": BusProtocol("serial", "drivers.serial_bus:SerialBus", "drivers.codecs.dynamixel:DynamixelCodec"),
     "unitree_hg": BusProtocol("dds", "drivers.dds_bus:DdsBus", "drivers.codecs.unitree_hg:UnitreeHgCodec"),
 }

@@ -79,6 +79,8 @@ class SimMotors:
     ``_targets`` of what it was told (``_obey``), to ``_configure`` itself by its registers and to ``_trip``.
     """
 
+    speaks = False  # without being asked: see ``unasked``
+
     def __init__(
         self,
         buses: Sequence[BusSpec],
@@ -148,6 +150,10 @@ class SimMotors:
     def receive(self, bus: int, id: int, raw: bytes, time: float) -> Answer | None:
         """A frame that ended at ``time`` on a bus: the answer (row, arbitration key, raw frame, bits), or None."""
         raise NotImplementedError
+
+    def unasked(self, start: float, end: float) -> list[tuple[int, float, Answer]]:
+        """What motors say from ``start`` to ``end`` by themselves: (bus, time, frame)."""
+        return []
 
     def _pack_feedback(self) -> np.ndarray:
         """The feedback (FRAME, (n,)) of every motor."""

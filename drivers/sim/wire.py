@@ -139,6 +139,12 @@ class SimCan:
         for i, (id, n) in enumerate(zip(ids, bits, strict=True)):
             self._queue.append((ready, priority(id), id, raw[16 * i : 16 * i + 16], n, 0))
 
+    def say(self, ready: float, answer: tuple[int, int, bytes, int]) -> None:
+        """A motor wants to send a frame (row, key, raw frame, bits) from ``ready`` on, without having been asked."""
+        row, key, raw, bits = answer
+        self._order += 1
+        insort(self._waiting, (ready, key, self._order, raw, bits, row, 0))
+
     @property
     def busy(self) -> bool:
         """Somebody wants to send, or something is on its way to the host."""

@@ -98,6 +98,9 @@ class World:
             start = end - self._timestep
             if self._power and self._power[0][0] <= start + TOLERANCE:
                 self._switch_power(start)
+            if self.motors.speaks:
+                for bus, ready, answer in self.motors.unasked(start, end):
+                    self.buses[bus].say(ready, answer)
             self._carry(end)
             self.motors.act(start, end)
             self.plant.step()

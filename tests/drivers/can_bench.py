@@ -21,13 +21,14 @@ RIGS: dict[str, tuple[str, list[tuple[int, int]]]] = {
     "mini_cheetah": ("mini-cheetah", [(1, 0), (0xFF, 0)]),
     "cubemars": ("AK80-9", [(1, 0), (2, 0)]),
     "robstride_mit": ("RS02", [(1, 0), (0x7F, 0)]),
+    "odrive": ("D6374-8:1", [(0, 0), (63, 0)]),
 }
 WATCHDOG = 0.05  # s
-# Where connecting cannot program it: what the motor was set to before, by serial line.
+FORGETFUL = ("mini_cheetah", "cubemars", "robstride_mit")  # take up the next command as if nothing had been
+# Where connecting cannot program it: what the motor was set to before, by serial line or USB.
 SET_BEFORE = {
-    name: {joint: {"TIMEOUT": WATCHDOG / CYCLE} for joint in ("left", "right")}
-    for name, protocol in PROTOCOLS.items()
-    if not protocol.watchdog
+    **{name: {joint: {"TIMEOUT": WATCHDOG / CYCLE} for joint in ("left", "right")} for name in FORGETFUL},
+    "odrive": {joint: {"WATCHDOG_TIMEOUT": WATCHDOG} for joint in ("left", "right")},
 }
 RATE = 250.0  # Hz
 

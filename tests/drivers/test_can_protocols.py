@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from can_bench import RATE, RIGS, SET_BEFORE, Bench, rig
+from can_bench import FORGETFUL, RATE, RIGS, SET_BEFORE, Bench, rig
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sim_robots import ARM_INERTIA
@@ -111,8 +111,8 @@ def test_a_silent_host_takes_the_drive_away(tmp_path, protocol):
     assert (bench.torque * moving <= 0.0).all()  # nothing pulls towards the target any more
     tripped = [e.time for e in bench.world.motor_log if e.event == "watchdog"]
     assert len(tripped) == 2 and all(0.05 <= t - last < 0.055 for t in tripped)
-    if protocol in SET_BEFORE:
-        return  # mini-cheetah motors and their kin take up the next command as if nothing had been
+    if protocol in FORGETFUL:
+        return
     bench.run(0.1, position=2.0, kp=2.0, kd=0.1)  # a command alone does not bring it back
     assert (bench.torque * bench.world.plant.joint_vel <= 0.0).all()
     assert not bench.poll(0.1).enabled.any()
