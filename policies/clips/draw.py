@@ -19,8 +19,9 @@ from policies.clips.format import Clip, ClipError
 from policies.clips.kinematics import smooth
 from policies.clips.resample import resample
 from policies.clips.robot import RobotBody
+from policies.clips.targets import scaled_ball
 
-SIZE = (320, 300)  # pixels of one picture: width, height
+SIZE = (240, 240)  # pixels of one picture: width, height
 FPS = 20.0
 BONE, SKIN, TOUCH = (0.25, 0.45, 0.75, 1.0), (0.16, 0.30, 0.52, 1.0), (0.90, 0.20, 0.15, 1.0)
 ROBOT_GROUP = 1
@@ -118,14 +119,13 @@ def _capsule(scene: mujoco.MjvScene, a: np.ndarray, b: np.ndarray, radius: float
 def scaled(clip: Clip, scale: float, ball_radius: float, fps: float) -> Clip:
     """A human ``clip`` at the robot's size and time, so that one can look at both with one camera."""
     clip = resample(clip, fps, slower=float(np.sqrt(scale)))
-    lift = [0, 0, skeleton.BALL_RADIUS]
     return Clip(
         clip.header.model_copy(update={"length_scale": scale, "ball_radius": ball_radius}),
         base_position_in_world=scale * clip.base_position_in_world,
         base_orientation_in_world=clip.base_orientation_in_world,
         joint_pos=clip.joint_pos,
         points_in_world=scale * clip.points_in_world,
-        ball_position_in_world=scale * (clip.ball_position_in_world - lift) + [0, 0, ball_radius],
+        ball_position_in_world=scaled_ball(clip.ball_position_in_world, scale, ball_radius),
         ball_velocity_in_world=scale * clip.ball_velocity_in_world,
         contact=clip.contact,
     )

@@ -27,8 +27,10 @@ FIRST_STEPS, STEPS, POLISH_STEPS = (
     4,
 )  # inverse kinematics steps for the first frame, every further one, and in pass 2
 DAMPING = 1e-3
+VELOCITY_SHARE = 0.7  # of the joint velocity limits, in the first pass: putting a palm back on the ball adds some
 MARGIN = 0.02  # rad inside the joint limits, as the safety gate demands by default
-SMOOTHING = 1.5  # frames, between the passes
+SMOOTHING = (1.5, 0.8)  # frames, before each further pass
+LAST_SMOOTHING = 0.6  # frames, at the end: halves a jerk of one frame, and costs a fast palm a few mm
 CLEARANCE = 0.005  # m between arms and everything else of the robot
 
 
@@ -49,15 +51,16 @@ class Costs:
     palm_on_ball: float  # added to `palm` where it is placed by the ball
     fingers: float
     posture: float
+    posture_of_waist: float
 
 
 FOLLOW = Costs(
     base=1.0, base_turn=2.0, trunk_turn=1.0, balance=2.0, knee=0.3, foot=5.0, foot_turn=2.0, stance=20.0, elbow=0.7,
-    palm=2.0, palm_on_ball=8.0, fingers=0.3, posture=0.03,
+    palm=2.0, palm_on_ball=8.0, fingers=0.15, posture=0.03, posture_of_waist=0.03,
 )  # fmt: skip
 POLISH = Costs(
-    base=3.0, base_turn=3.0, trunk_turn=0.3, balance=0.0, knee=0.0, foot=10.0, foot_turn=5.0, stance=60.0, elbow=0.0,
-    palm=0.0, palm_on_ball=40.0, fingers=0.0, posture=0.6,
+    base=20.0, base_turn=10.0, trunk_turn=0.3, balance=0.0, knee=0.0, foot=10.0, foot_turn=5.0, stance=60.0, elbow=0.0,
+    palm=0.0, palm_on_ball=40.0, fingers=0.0, posture=0.6, posture_of_waist=2.0,
 )  # fmt: skip
 
 
@@ -69,7 +72,7 @@ class Imitator:
         self.model = model = body.model
         self.configuration = mink.Configuration(model)
         self.dt = 1.0 / fps / steps
-        velocities = dict(zip(body.robot.joint_names, body.robot.velocity_max, strict=True))
+        velocities = dict(zip(body.robot.joint_names, VELOCITY_SHARE * body.robot.velocity_max, strict=True))
         apart = mink.CollisionAvoidanceLimit(
             model,
             self._arms_and_the_rest(),
@@ -86,6 +89,8 @@ class Imitator:
         self.elbows = [mink.FrameTask(bodies[f"{side}_elbow"], "body", 1.0, 0.0) for side in SIDES]
         self.palms = [mink.FrameTask(f"{side}_palm", "site", 1.0, 1.0) for side in SIDES]
         self.posture = mink.PostureTask(model, 1.0)
+        self.waist = np.zeros(model.nv, bool)
+        self.waist[body.qvel_at] = [j.group == "waist" for j in body.robot.joints]
         self.finger_axes = [self._finger_axis(k) for k in range(2)]
         self.tasks = [
             *(self.base, self.trunk, self.balance, self.posture),
@@ -122,7 +127,7 @@ class Imitator:
         self.trunk.set_orientation_cost(costs.trunk_turn)
         self.balance.set_target(goal.centre_of_mass[t])
         self.balance.set_cost([costs.balance, costs.balance, 0.0])
-        self.posture.set_cost(costs.posture)
+        self.posture.set_cost(np.where(self.waist, costs.posture_of_waist, costs.posture))
         for k in range(2):
             self.knees[k].set_target(_pose(goal.knees[t, k], np.eye(3)))
             self.knees[k].set_position_cost(costs.knee)
@@ -203,7 +208,9 @@ def retarget(clip: Clip, body: RobotBody, fps: float = FPS, ball_radius: float =
     )
     if reachable is not goal:
         goal, path = reachable, imitator.follow(reachable)
-    path = imitator.polish(goal, _smoothed(path, SMOOTHING))
+    for width in SMOOTHING:
+        path = imitator.polish(goal, _smoothed(path, width))
+    path = _smoothed(path, LAST_SMOOTHING)
     return _clip(clip, body, goal, path), goal
 
 

@@ -23,6 +23,7 @@ from policies.clips.skeleton import INDEX
 
 BODY_SMOOTHING = 1.0  # frames of the recording: fingers and wrists jump
 NEAR, FAR = 0.22, 0.45  # m from hand to ball centre in the recording: placed by the ball, by the shoulder
+CLOSING = 2  # frames: over the last of these before a touch, and the first after, a palm comes or goes evenly
 OPPOSED = (
     0.75  # 0: both hands touch where the person's do; 1: exactly opposite. A hand without fingers holds by friction
 )
@@ -63,6 +64,13 @@ def length_scale(body: RobotBody) -> float:
     return body.leg_length / float(thigh + shin + skeleton.ANKLE_HEIGHT)
 
 
+def scaled_ball(ball: np.ndarray, s: float, radius: float) -> np.ndarray:
+    """The recorded ball (T, 3) m as one of ``radius`` m in a world ``s`` as large. It touches the floor where the
+    recorded one does and no deeper: that one rests at 0.11 m, of a radius of 0.12 m, and is squeezed to less."""
+    scaled = s * (ball - [0, 0, skeleton.BALL_RADIUS]) + [0, 0, radius]
+    return np.concatenate([scaled[:, :2], np.maximum(scaled[:, 2:], radius)], axis=1)
+
+
 def targets(clip: Clip, body: RobotBody, fps: float, ball_radius: float, hand_radius: float) -> Targets:
     """Everything a human ``clip`` asks of the robot, at the robot's ``fps``. Raises ClipError for a robot's clip."""
     if clip.header.body != "human":
@@ -70,7 +78,7 @@ def targets(clip: Clip, body: RobotBody, fps: float, ball_radius: float, hand_ra
     s = length_scale(body)
     clip = resample(_smoothed(clip), fps, slower=np.sqrt(s))
     points = clip.points_in_world
-    ball = s * (clip.ball_position_in_world - [0, 0, skeleton.BALL_RADIUS]) + [0, 0, ball_radius]
+    ball = scaled_ball(clip.ball_position_in_world, s, ball_radius)
     base_frame = kinematics.matrix_from_quaternion(clip.base_orientation_in_world)
     hips = s * (points[:, INDEX["L_Hip"]] + points[:, INDEX["R_Hip"]]) / 2
     base = hips - base_frame @ (body.rest["left_hip"] + body.rest["right_hip"]) / 2
@@ -228,15 +236,27 @@ def _palms(clip: Clip, s: float, ball: np.ndarray, touch: float) -> tuple[np.nda
     to_hand = centre - clip.ball_position_in_world[:, None]
     distance = hand_distance(points, clip.ball_position_in_world)
     contact = clip.contact[:, :2]
+    apart = np.stack([_frames_to(contact[:, k]) for k in range(2)], axis=1)
     x = np.clip((FAR - distance) / (FAR - NEAR), 0, 1)
-    by_ball = np.maximum(smooth(np.where(contact, 1.0, 3 * x**2 - 2 * x**3), 1.5), contact)
+    by_ball = smooth(np.where(apart <= CLOSING, 1.0, 3 * x**2 - 2 * x**3), 1.5)
+    by_ball = np.where(contact, 1.0, np.clip(by_ball, 0.0, 1.0))
     gap = np.linalg.norm(to_hand, axis=-1)
     closed = np.array([np.median(gap[contact[:, k], k]) if contact[:, k].any() else 0.16 for k in range(2)])
-    away = np.where(contact, 0.0, s * np.maximum(gap - closed, 0.0))
+    share = np.clip(apart / CLOSING, 0, 1)
+    away = (3 * share**2 - 2 * share**3) * s * smooth(np.maximum(gap - closed, 0.0), 1.5)
     towards = unit(smooth(unit(to_hand), 1.5))
     both = (by_ball[:, 0] * by_ball[:, 1])[:, None, None]
     towards = unit(towards - OPPOSED * both * towards.mean(axis=1, keepdims=True))
-    return ball[:, None] + towards * (touch + away)[..., None], np.clip(by_ball, 0.0, 1.0)
+    return ball[:, None] + towards * (touch + away)[..., None], by_ball
+
+
+def _frames_to(on: np.ndarray) -> np.ndarray:
+    """(T,) frames from each to the nearest where (T,) is True; T + 1 where none is."""
+    frames = np.arange(len(on))
+    where = np.flatnonzero(on)
+    if not len(where):
+        return np.full(len(on), len(on) + 1)
+    return abs(frames[:, None] - where).min(axis=1)
 
 
 def pulled_in(goal: Targets, shoulders: np.ndarray, arm_length: float) -> Targets:
@@ -255,7 +275,7 @@ def pulled_in(goal: Targets, shoulders: np.ndarray, arm_length: float) -> Target
     held = goal.touching.any(axis=1)
     offset = np.zeros_like(pull)
     for start, stop in spans(held):
-        offset[start:stop] = smooth(pull[start:stop], 3.0)
+        offset[start:stop] = smooth(_largest_nearby(pull[start:stop], 3), 2.0)
     frames, contacts = np.arange(len(held)), np.flatnonzero(held)
     shift = np.stack([np.interp(frames, contacts, offset[contacts, axis]) for axis in range(3)], axis=1)
     low = np.flatnonzero((goal.ball[:, 2] < goal.ball_radius + 0.03) & ~held)
@@ -267,3 +287,10 @@ def pulled_in(goal: Targets, shoulders: np.ndarray, arm_length: float) -> Target
         ball_velocity=goal.ball_velocity + kinematics.rate(shift, goal.fps),
         palms=goal.palms + shift[:, None],
     )
+
+
+def _largest_nearby(x: np.ndarray, reach: int) -> np.ndarray:
+    """(T, 3): of the vectors at most ``reach`` frames away, the longest."""
+    frames = np.arange(len(x))
+    nearby = abs(frames[:, None] - frames) <= reach
+    return x[np.where(nearby, np.linalg.norm(x, axis=1), -1.0).argmax(axis=1)]

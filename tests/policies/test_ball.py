@@ -86,7 +86,7 @@ def test_touches_floor_hands_and_feet(robot):
     model = spec.compile()
     ours = model.geom(NAME).id
     solid = [g for g in range(model.ngeom) if g != ours and (model.geom_contype[g] or model.geom_conaffinity[g])]
-    assert len(solid) > 10
+    assert solid
     deaf = [
         model.geom(g).name
         for g in solid
