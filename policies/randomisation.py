@@ -86,9 +86,9 @@ TABLE: dict[str, Term] = {
     "joint_offset": Term(-0.02, 0.02, "joints", "rad: calibration"),
     "imu_tilt": Term(-0.02, 0.02, 2, "rad: how the IMU is mounted (roll, pitch)"),
     "joint_pos_noise": Term(0.0, 0.005, 1, "rad, standard deviation: encoder and gear play"),
-    "joint_vel_noise": Term(0.0, 0.2, 1, "rad/s, standard deviation: differentiated encoder"),
-    "gyro_noise": Term(0.0, 0.1, 1, "rad/s, standard deviation"),
-    "gravity_noise": Term(0.0, 0.02, 1, "rad, standard deviation: attitude filter"),
+    "joint_vel_noise": Term(0.0, 0.1, 1, "rad/s, standard deviation: differentiated encoder"),
+    "gyro_noise": Term(0.0, 0.05, 1, "rad/s, standard deviation: ten times a MEMS gyro's, for vibration"),
+    "gravity_noise": Term(0.0, 0.01, 1, "rad, standard deviation: attitude filter"),
     # time: the guardian runs at 250 Hz, a bus tick takes 1 to 3 ms, states are up to a tick old
     "action_delay": Term(0.0, 3.0, 1, "substeps of 5 ms (whole ones): command to motor"),
     "state_delay": Term(0.0, 2.0, 1, "substeps of 5 ms (whole ones): motor to policy"),
