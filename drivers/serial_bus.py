@@ -106,6 +106,7 @@ class SerialBus:
         self._due = -np.inf  # s, when its answers are over at the latest
         self._heard = -np.inf  # s, when bytes last came
         self._open = False  # a request whose outcome is not settled
+        self._answers = 0  # to it
         self._fast = False
         self._fast_failures = 0
         self._off = False  # switched off by ``disable``
@@ -259,7 +260,9 @@ class SerialBus:
         data = self._receive()
         if data:
             self._heard = now
-            self.counters.received += self._codec.unpack(data, self._state, now)
+            answers = self._codec.unpack(data, self._state, now)
+            self._answers += answers
+            self.counters.received += answers
             self.counters.rejected = self._codec.rejected
         return self._state
 
@@ -269,6 +272,13 @@ class SerialBus:
     def close(self) -> None:
         self._wire.close()
 
+    @property
+    def waiting(self) -> float:
+        """s for which answers to the last request may still come; 0: it is the host's turn."""
+        if self._clock is None or not self._open or self._whole_answer():
+            return 0.0
+        return max(0.0, self._due - self._clock.now())
+
     # -- turns -------------------------------------------------------------------------------------------------------
 
     def _my_turn(self) -> bool:
@@ -277,20 +287,19 @@ class SerialBus:
             raise BusError(f"bus {self.spec.name}: not connected; call connect(clock) first")
         if not self._open:
             return True
-        answered = self._state.time > self._asked
-        whole = bool(answered.all())
-        if not whole and self._clock.now() < self._due:
+        if self.waiting > 0.0:
             self.counters.lost += 1
             self.counters.extra["line_busy"] += 1
             return False
+        whole = self._whole_answer()
         self._open = False
         if not whole:
             self.counters.received += self._codec.finish(self._state, self._heard)
             self.counters.rejected = self._codec.rejected
-            answered = self._state.time > self._asked
         if whole:
             self._order = self._everyone
         else:  # the first silent one may be the reason why those behind it are
+            answered = self._state.time > self._asked
             silent = self._order[~answered[self._order]]
             self._order = np.concatenate([self._order[answered[self._order]], silent[1:], silent[:1]])
         if self._fast:
@@ -309,6 +318,12 @@ class SerialBus:
         self._asked = self._clock.now()
         self._due = self._asked + size * self._byte + REPLY_MARGIN
         self._open = True
+        self._answers = 0
+
+    def _whole_answer(self) -> bool:
+        """Whether everybody answered the last request."""
+        n = len(self.spec.motors)
+        return self._answers >= n and bool((self._state.time > self._asked).all())
 
     def _transmit(self, data: bytes, required: bool = False) -> None:
         """Send one tick. ``required``: a full queue is an error at once, and not only after QUEUE_FULL_TIME."""

@@ -206,8 +206,8 @@ STATE_FIELDS = [("torque_enable", "u1"), ("error", "u1"), ("watchdog", "u1"), ("
 STATE_ITEM = np.dtype(STATE_FIELDS)
 STATUS = np.dtype([("head", "<u8"), ("alert", "u1"), ("state", STATE_ITEM), ("crc", "<u2")])
 FAST_ITEM = np.dtype([("alert", "u1"), ("id", "u1"), ("state", STATE_ITEM), ("crc", "<u2")])
-_ID_MASK = 0xFF << 32
-_STATUS_HEAD = int.from_bytes(HEADER + bytes([0, STATE_SIZE + 4, 0, Instruction.STATUS]), "little")
+HEAD_SIZE = 8  # bytes before the error byte
+_TAIL_PLACES = (np.arange(STATE_SIZE + 3) * 256)[:, None]
 BAUD_RATES = {0: 9600, 1: 57600, 2: 115200, 3: 1_000_000, 4: 2_000_000, 5: 3_000_000, 6: 4_000_000, 7: 4_500_000}
 FIRMWARE_MIN = 38  # the first with a bus watchdog
 
@@ -242,9 +242,13 @@ def crc16(data: bytes | np.ndarray) -> int:
     return int(np.bitwise_xor.reduce(_crc_table().take(values + _places(len(values))), initial=0))
 
 
-def crc16_rows(data: np.ndarray) -> np.ndarray:
-    """CRC-16 (m,) uint16 of each row of ``data`` (m, length) uint8."""
-    return np.bitwise_xor.reduce(_crc_table().take(data + _places(data.shape[1])), axis=1)
+@cache
+def _tail_table() -> np.ndarray:
+    """The rows of the CRC table for what follows the head of a STATUS, and for its CRC the bytes themselves: over a good
+    one, all entries together are what its head adds to the CRC."""
+    rows = _crc_table().reshape(-1, 256)[-(STATE_SIZE + 1) :]
+    crc = np.array([np.arange(256), np.arange(256) << 8], np.uint16)
+    return np.concatenate([rows, crc]).reshape(-1)
 
 
 def stuff(body: bytes) -> bytes:
@@ -427,7 +431,18 @@ class DynamixelCodec:
         self._goal_packet = np.frombuffer(prefix + bytes(n * GOAL_ITEM.itemsize), np.uint8).copy()
         self._goals = self._goal_packet[len(prefix) :].view(GOAL_ITEM)
         self._goals["id"] = self.ids
+        self._everyone = np.arange(n)
+        self._given = np.zeros((5, n))
+        self._kp = b""  # that the gains in the packet are for
+        self._requests: dict[tuple[bytes, bool], bytes] = {}
         self._fast_rows = np.zeros(0, np.intp)  # of the last fast request, in its order
+        self._asked = self._fast_rows  # rows of the last plain one
+        self._answered = 0  # of these
+        self._in_order = False  # they are 0, 1, 2, ...
+        heads = [HEADER + bytes([id, STATE_SIZE + 4, 0, Instruction.STATUS]) for id in self.ids.tolist()]
+        self._all_heads = np.frombuffer(b"".join(heads), "<u8")
+        self._all_head_crcs = np.array([crc16(head + bytes(STATE_SIZE + 1)) for head in heads], np.uint16)
+        self._heads, self._head_crcs = self._all_heads[:0], self._all_head_crcs[:0]
 
     # -- to the servos -----------------------------------------------------------------------------------------------
 
@@ -438,22 +453,37 @@ class DynamixelCodec:
     def pack_command(self, command: MotorCommand) -> bytes:
         """P gains and goal positions of all servos in one sync write. Saturates at the ranges of gain and position;
         raises ValueError for a value not finite."""
-        c = command
-        if not np.isfinite([c.position, c.velocity, c.kp, c.kd, c.torque]).all():
+        c, given = command, self._given
+        given[0], given[1], given[2], given[3], given[4] = c.position, c.velocity, c.kp, c.kd, c.torque
+        if not np.isfinite(given).all():
             raise ValueError(
                 f"bus {self._spec.name}: got a command that is not finite, expected numbers; nothing was sent"
             )
-        with np.errstate(over="ignore"):
-            shift = np.divide(c.kd * c.velocity + c.torque, c.kp, out=np.zeros(len(self.ids)), where=c.kp > 0)
-            position = (c.position + shift) / TICK + ZERO
-        self._goals["p_gain"] = np.clip(np.rint(c.kp * self._gain), 0, GAIN_MAX)
-        self._goals["position"] = np.clip(np.rint(position), self._low, self._high)
+        position = c.position
+        if c.velocity.any() or c.torque.any():
+            with np.errstate(over="ignore"):
+                shift = np.divide(c.kd * c.velocity + c.torque, c.kp, out=np.zeros(len(self.ids)), where=c.kp > 0)
+                position = position + shift
+        if (kp := c.kp.tobytes()) != self._kp:
+            self._kp = kp
+            self._goals["p_gain"] = np.clip(np.rint(c.kp * self._gain), 0, GAIN_MAX)
+        ticks = position * (1.0 / TICK)
+        ticks += ZERO
+        np.minimum(np.rint(ticks, out=ticks), self._high, out=ticks)
+        self._goals["position"] = np.maximum(ticks, self._low, out=ticks)
         return self._sealed(self._goal_packet)
 
     def pack_request(self, rows: np.ndarray, fast: bool = False) -> bytes:
         """Ask the servos ``rows`` for their state, in this order."""
-        self._fast_rows = rows if fast else rows[:0]
-        return pack_sync_read(self.ids[rows].tobytes(), STATE_AT, STATE_SIZE, fast)
+        self._fast_rows, self._asked = (rows, rows[:0]) if fast else (rows[:0], rows)
+        self._heads, self._head_crcs = self._all_heads[self._asked], self._all_head_crcs[self._asked]
+        self._answered, self._in_order = 0, rows is self._everyone or np.array_equal(rows, self._everyone)
+        key = rows.tobytes(), fast
+        if key not in self._requests:
+            if len(self._requests) > 100:
+                self._requests.clear()
+            self._requests[key] = pack_sync_read(self.ids[rows].tobytes(), STATE_AT, STATE_SIZE, fast)
+        return self._requests[key]
 
     def reply_size(self, n: int, fast: bool = False) -> int:
         """Bytes that ``n`` servos answer to that, without stuffing."""
@@ -512,24 +542,30 @@ class DynamixelCodec:
     def unpack(self, data: bytes, state: MotorState, now: float) -> int:
         """Put the states among ``data`` into ``state``; an incomplete packet waits for the next call. Returns how many
         servos answered; ``rejected`` counts what was no good."""
-        whole = data and not self._parser.pending and len(data) % STATUS.itemsize == 0
-        if whole and self._unpack_regular(data, state, now):
-            return len(data) // STATUS.itemsize
-        return self._unpack_any(data, state, now)
+        if rest := self._parser.pending:  # bytes come in pieces; put back together, they nearly always are regular
+            self._parser.clear()
+            data = rest + data
+        whole = len(data) - len(data) % STATUS.itemsize
+        if not whole or not self._unpack_regular(data[:whole], state, now):
+            return self._unpack_any(data, state, now)
+        if whole < len(data):
+            return whole // STATUS.itemsize + self._unpack_any(data[whole:], state, now)
+        return whole // STATUS.itemsize
 
     def _unpack_regular(self, data: bytes, state: MotorState, now: float) -> bool:
-        """The same if ``data`` are undamaged states without stuffing, as nearly always; else do nothing."""
+        """The same if ``data`` are the next answers to the last request, undamaged and without stuffing, as nearly
+        always; else do nothing."""
         status = np.frombuffer(data, STATUS)
-        head = status["head"]
-        if (head & ~np.uint64(_ID_MASK) != _STATUS_HEAD).any():
+        n = len(status)
+        at = slice(self._answered, self._answered + n)
+        rows = self._asked[at]
+        if len(rows) < n or (status["head"] != self._heads[at]).any():
             return False
-        rows = self._row_of[(head >> np.uint64(32) & np.uint64(0xFF)).astype(np.intp)]
-        if (rows < 0).any():
+        tail = np.frombuffer(data, np.uint8).reshape(n, -1)[:, HEAD_SIZE:]
+        if (np.bitwise_xor.reduce(_tail_table().take(tail.T + _TAIL_PLACES), axis=0) != self._head_crcs[at]).any():
             return False
-        raw = status.view(np.uint8).reshape(len(status), -1)
-        if (crc16_rows(raw[:, :-2]) != status["crc"]).any():
-            return False
-        self._store(rows, status["state"], state, now)
+        self._answered += n
+        self._store(at if self._in_order else rows, status["state"], state, now)
         return True
 
     def _unpack_any(self, data: bytes, state: MotorState, now: float) -> int:
@@ -579,15 +615,18 @@ class DynamixelCodec:
             blocks.append(item[2:-2])
         return rows, blocks
 
-    def _store(self, rows: np.ndarray, item: np.ndarray, state: MotorState, now: float) -> None:
-        tripped = item["watchdog"] == WATCHDOG_TRIPPED
+    def _store(self, rows: np.ndarray | slice, item: np.ndarray, state: MotorState, now: float) -> None:
         state.position[rows] = (item["position"] - float(ZERO)) * TICK
         state.velocity[rows] = item["velocity"] * VELOCITY_UNIT
         state.torque[rows] = item["current"] * self._torque[rows]
         state.temperature[rows] = item["temperature"]
-        state.error[rows] = item["error"] + TRIPPED * tripped
-        state.enabled[rows] = (item["torque_enable"] == 1) & ~tripped
+        state.error[rows] = item["error"]
+        state.enabled[rows] = item["torque_enable"] == 1
         state.time[rows] = now
+        tripped = item["watchdog"] == WATCHDOG_TRIPPED
+        if tripped.any():
+            state.error[rows] += TRIPPED * tripped
+            state.enabled[rows] &= ~tripped
 
     def unpack_register(self, register: str, data: bytes) -> list[tuple[int, int]]:
         """Answers (row, value) to ``pack_read`` of that register among ``data``."""

@@ -15,11 +15,13 @@ import select
 import sys
 import time
 import tty
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from drivers.bus import BusError, BusSpec, MotorSpec
+from drivers.sim.faults import parse_fault
 from drivers.sim.serial_line import SerialLine
 from drivers.sim.servo import SimServos
 
@@ -95,18 +97,15 @@ class PtyServer:
         os.close(self._master)
 
 
-def serve_servos(spec: BusSpec, *, instant: bool = False, fast: bool = True, lost: str = "") -> PtyServer:
-    """A server of the servos of ``spec``. ``lost``: the joint whose answers never arrive."""
-    from dataclasses import replace
-
-    from drivers.sim.faults import Fault
-
+def serve_servos(spec: BusSpec, *, instant: bool = False, fast: bool = True, faults: Sequence[str] = ()) -> PtyServer:
+    """A server of the servos of ``spec``. ``instant``: no time on the line. Raises BusError for an unknown model or
+    fault."""
     body = Wheels(len(spec.motors))
     servos = SimServos(spec, body, fast=fast)
     timing = {"latency": 0.0, "gap": 0.0} if instant else {"latency": 0.0}
     line = SerialLine(replace(spec, bitrate=INSTANT) if instant else spec, servos, **timing)
-    if lost:
-        line.inject(Fault("drop", motor=lost))
+    for fault in faults:
+        line.inject(parse_fault(fault))
     return PtyServer(line, body)
 
 
@@ -125,11 +124,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--baud", type=int, default=4_000_000)
     parser.add_argument("--instant", action="store_true", help="no time on the line")
     parser.add_argument("--no-fast", action="store_true", help="firmware without fast reads")
-    parser.add_argument("--lost", default="", metavar="JOINT", help="lose every answer of servo_N")
+    parser.add_argument("--fault", action="append", default=[], help="like drop:servos/servo_3@5; see faults.py")
     a = parser.parse_args(argv)
     parent = os.getppid()
     try:
-        server = serve_servos(bus_of(a.model, a.count, a.baud), instant=a.instant, fast=not a.no_fast, lost=a.lost)
+        server = serve_servos(bus_of(a.model, a.count, a.baud), instant=a.instant, fast=not a.no_fast, faults=a.fault)
     except BusError as error:
         print(error, file=sys.stderr)
         return 2

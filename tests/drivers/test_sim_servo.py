@@ -362,6 +362,14 @@ def until_heard(call, tries: int = 20):
     raise AssertionError(f"no answer in {tries} tries: {result}")
 
 
+def heard_fast(group) -> bool:
+    """Taking a late answer of another servo for the fast one, the SDK stumbles."""
+    try:
+        return group.fastSyncRead() == 0
+    except IndexError:
+        return False
+
+
 def test_sdk_pings_reads_and_writes(sdk):
     _, serial, packets = sdk
     for id in (1, 4):
@@ -392,7 +400,7 @@ def test_sdk_moves_servos_with_sync_write_and_sees_it_with_sync_read(sdk):
     fast = api.GroupSyncRead(serial, packets, 132, 4)
     for id in (1, 2, 3, 4):
         fast.addParam(id)
-    assert any(fast.fastSyncRead() == 0 for _ in range(20))
+    assert any(heard_fast(fast) for _ in range(20))
     assert [abs(fast.getData(id, 132, 4) - 2048 - 100 * id) < 20 for id in (1, 2, 3, 4)] == [True] * 4
 
 
