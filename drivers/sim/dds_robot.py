@@ -31,6 +31,8 @@ class SimG1:
     ``stubborn``: how many requests to release it are ignored.
     """
 
+    speaks = False  # in CAN frames; LowState is StatePublisher's
+
     def __init__(
         self, spec: BusSpec, body: Body, *, mode_machine: int = 5, controller: str = "ai", stubborn: int = 0
     ) -> None:
