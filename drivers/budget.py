@@ -28,7 +28,7 @@ class Budget(NamedTuple):
 
     bus: str
     rate: float
-    frames: int  # a tick: a command and an answer for each motor, or TICK_FRAMES of the codec
+    frames: int  # a tick: a command and an answer for each motor, or what the codec says (TICK_FRAMES, MOTOR_FRAMES)
     bits: float  # a tick, typical
     bits_worst: float  # a tick, the most that stuffing can make of it
     load: float
@@ -51,7 +51,7 @@ def budget(spec: BusSpec, rate: float) -> Budget:
     return Budget(
         bus=spec.name,
         rate=rate,
-        frames=getattr(codec, "TICK_FRAMES", 2 * n),
+        frames=getattr(codec, "TICK_FRAMES", round(n * getattr(codec, "MOTOR_FRAMES", 2))),
         bits=typical,
         bits_worst=worst,
         load=typical * rate / spec.bitrate,
@@ -77,6 +77,7 @@ def check(spec: BusSpec, rate: float) -> Budget:
 # one table of 8 states x 2^14 chunks tells the next state and the stuff bits. Before the frame: a 1, once.
 CHUNK_BITS = 14
 CHUNK = 1 << CHUNK_BITS
+EXTENDED_SHIFT = 29  # of the flags in ``id``
 START = 4 * CHUNK  # state (1, once)
 _SHIFTS = np.array([55, 41, 27, 13], np.uint64)[:, None]  # of the payload, for chunks 1 to 4
 
@@ -84,12 +85,16 @@ _SHIFTS = np.array([55, 41, 27, 13], np.uint64)[:, None]  # of the payload, for 
 def frame_bits(frames: np.ndarray) -> np.ndarray:
     """Bits (n,) int64 that each of ``frames`` (FRAME, (n,)) takes on the wire, with stuff bits and the space behind it."""
     ids = frames["id"]
-    plain = (ids < 0x800) & (frames["length"] == 8)
+    whole = frames["length"] == 8
+    plain = (ids < 0x800) & whole
     if plain.all():
         return _plain_bits(ids, frames["data"])
+    extended = (ids >> EXTENDED_SHIFT == EXTENDED >> EXTENDED_SHIFT) & whole
+    other = ~(plain | extended)
     bits = np.empty(len(frames), np.int64)
     bits[plain] = _plain_bits(ids[plain], frames["data"][plain])
-    bits[~plain] = [_any_bits(frame) for frame in frames[~plain]]
+    bits[extended] = _extended_bits(ids[extended], frames["data"][extended])
+    bits[other] = [_any_bits(frame) for frame in frames[other]]
     return bits
 
 
@@ -115,7 +120,56 @@ def _plain_bits(ids: np.ndarray, data: np.ndarray) -> np.ndarray:
     return (entries & (CHUNK - 1)).sum(axis=0) + (7 * CHUNK_BITS + TAIL_BITS)
 
 
+def _extended_bits(ids: np.ndarray, data: np.ndarray) -> np.ndarray:
+    """The same for extended data frames with 8 bytes: 118 bits, 8 chunks and 6 bits, which are filled up with bits that
+    take turns and so need no stuffing."""
+    stuffing, crc_of = _tables()[0], _extended_crc()
+    id = ids.astype(np.int64) & 0x1FFF_FFFF
+    head = (
+        (id >> 18 << 2 | 0b11) << 18 | id & 0x3FFFF
+    ) << 7 | 0b000_1000  # start, 11, SRR, IDE, 18, RTR, r1, r0, length
+    words = words_of(data)
+    word = words.view(np.int64)
+    mask = CHUNK - 1
+    tail = [word >> shift & mask for shift in (0, 14, 28, 42)]
+    tail += [(head << 8 | (word >> 56 & 0xFF)) & mask, head >> 6 & mask, head >> 20 & mask, head >> 34]
+    crc = np.bitwise_xor.reduce(crc_of.take(np.array(tail) + _EXTENDED_OFFSETS), axis=0)
+    end = crc & 0x3F
+    chunks = [
+        head >> 25,
+        head >> 11 & mask,
+        (head & 0x7FF) << 3 | (word >> 61 & 0b111),
+        *(word >> shift & mask for shift in (47, 33, 19, 5)),
+        (word & 0x1F) << 9 | crc >> 6,
+        end << 8 | np.where(end & 1, 0x55, 0xAA),
+    ]
+    total = np.full(len(ids), 118 + TAIL_BITS)
+    state: np.ndarray | int = START
+    for chunk in chunks:
+        entry = stuffing.take(chunk | state)
+        state = entry & -CHUNK
+        total += entry & mask
+    return total
+
+
 _CRC_OFFSETS = (np.arange(6) * CHUNK)[:, None]
+
+
+_EXTENDED_OFFSETS = (np.arange(8) * CHUNK)[:, None]
+
+
+@cache
+def _extended_crc() -> np.ndarray:
+    """(8 * CHUNK,) the CRC of each chunk of 14 bits, counted from the end of what the CRC covers."""
+    contribution = [CRC_POLYNOMIAL]
+    while len(contribution) < 8 * CHUNK_BITS:
+        contribution.append(_crc_step(contribution[-1], 0))
+    chunk = np.arange(CHUNK)
+    crc_of = np.zeros((8, CHUNK), np.int64)
+    for k in range(8):
+        for b in range(CHUNK_BITS):
+            crc_of[k] ^= np.where(chunk >> b & 1, contribution[k * CHUNK_BITS + b], 0)
+    return crc_of.reshape(-1)
 
 
 @cache

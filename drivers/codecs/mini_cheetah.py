@@ -66,7 +66,7 @@ class MiniCheetahCodec:
     FILE: ClassVar[str] = "mini_cheetah.py"  # where MODELS is, for the error message
     MASTER: ClassVar[int] = 0  # identifier of answers where the wiring says 0
     LENGTHS: ClassVar[tuple[int, ...]] = (6, 7, 8)  # of answers; by firmware
-    TICK_BITS = (117.6 + 115.0, 135.0 + 135.0)  # as damiao: two frames of up to 8 bytes
+    TICK_BITS = (117.6 + 115.0, 135.0 + 135.0)  # of a command and an answer of 8 bytes, as Damiao's; others are shorter
 
     def __init__(self, spec: BusSpec) -> None:
         """Raises BusError for an unknown model, or identifiers by which the motors could not be told apart."""

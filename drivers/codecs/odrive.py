@@ -10,8 +10,8 @@ There are no gains in a command. The axis runs ``torque = vel_gain (v* + pos_gai
     vel_gain = kd (2 pi / gear^2)        pos_gain = kp / kd
 
 makes the law that was asked for, as long as ``v* + pos_gain (p* - p)`` is within the velocity limit. A kp without kd does
-not exist there: kd is raised to kp / POS_GAIN_MAX. Gains go out when they change, and those of one motor in each tick again,
-so that a lost frame lasts n ticks at most. Velocity and torque of a command are in thousandths, 16 bits.
+not exist there: kd is raised to kp / POS_GAIN_MAX. Gains go out when they change, and one of the 2 n in each tick again, so
+that a lost frame lasts 2 n ticks at most. Velocity and torque of a command are in thousandths, 16 bits.
 
 Whether an axis obeys is only in its heartbeat, which comes every 100 ms unless axis.config.can.heartbeat_rate_ms says
 otherwise: set it to 10 (and encoder_rate_ms to 0, for estimates are asked for). Without a heartbeat a motor does not count as
@@ -161,8 +161,14 @@ def command_of(law: Law, gear: np.ndarray) -> MotorCommand:
 class OdriveCodec:
     """The host's side of one bus (a ``can_bus.CanCodec``). It remembers which gains each axis has."""
 
-    # Bits of SET_INPUT_POS, the question for estimates and its answer, and every third tick of that for the current.
-    TICK_BITS = (120.0 + 50.0 + 120.0 + 170.0 / 3, 135.0 + 58.0 + 135.0 + 193.0)
+    # Bits of SET_INPUT_POS, the question for estimates and its answer, every third tick of that for the current, and every
+    # second (100 Hz at a rate of 200 Hz) of a heartbeat: means of random traffic. For the whole bus, one gain a tick.
+    TICK_BITS = (
+        118.5 + 48.0 + 115.1 + (48.0 + 116.2) / 3 + 123.0 / 2,
+        135.0 + 55.0 + 135.0 + (55.0 + 135.0) / 3 + 135.0 / 2,
+    )
+    TICK_OVERHEAD_BITS = 119.2
+    MOTOR_FRAMES = 3 + 2 / 3 + 1 / 2
 
     def __init__(self, spec: BusSpec) -> None:
         """Raises BusError for an unknown model or a node that cannot be."""
@@ -213,7 +219,7 @@ class OdriveCodec:
     def _pack_gains(self, law: Law) -> list[np.ndarray]:
         wanted = np.array([law.pos_gain, law.vel_gain])
         due = wanted != self._gains
-        due[:, self._turn % len(self._nodes)] = True
+        due.flat[self._turn % due.size] = True
         self._gains = wanted
         frames = []
         for quantity, row in np.argwhere(due):

@@ -5,8 +5,8 @@
 The position law runs in the device, on gains that are its own state (parameters POSITION_KP and VELOCITY_KP), not part of a
 command: ``torque = kp (position - q) - kd dq``. A velocity target and a feed-forward torque are ignored in position mode.
 So a command (kp, kd, p, v, t) is sent as the position ``p + (kd v + t) / kp``, which makes the same torque; with kp = 0
-there is no such position, and v and t are lost; and the device keeps the sum within its position limits. Gains go out when they change, and those of one motor in each tick
-again, so that a lost frame lasts n ticks at most.
+there is no such position, and v and t are lost; and the device keeps the sum within its position limits. Gains go out when they change, and one of the
+2 n in each tick again, so that a lost frame lasts 2 n ticks at most.
 
 Feedback of a command is position and velocity only. Mode, error and torque are asked by SDO, whose answers do not say what
 they answer: each motor is asked for one parameter at a time, and again only when it has answered or had time to.
@@ -202,8 +202,11 @@ def _bytes(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 class RecoilCodec:
     """The host's side of one bus (a ``can_bus.CanCodec``). It remembers which gains each device has, and what it was asked."""
 
-    # Bits of RPDO2 and TPDO2 (120.5 each, measured on random targets) and, every third tick, of an SDO and its answer.
-    TICK_BITS = (120.5 + 120.5 + (78 + 85) / 3, 135.0 + 135.0 + (85 + 95))
+    # Bits of RPDO2 and TPDO2 and, every third tick, of an SDO question (3 bytes) and its answer (4 bytes): means of random
+    # targets and states. For the whole bus, one gain a tick.
+    TICK_BITS = (120.5 + 115.1 + (77.0 + 84.0) / 3, 135.0 + 135.0 + (85.0 + 95.0) / 3)
+    TICK_OVERHEAD_BITS = 120.0
+    MOTOR_FRAMES = 2 + 2 / 3
 
     def __init__(self, spec: BusSpec) -> None:
         """Raises BusError for an unknown model or ids that a device cannot have."""
@@ -255,7 +258,7 @@ class RecoilCodec:
     def _pack_gains(self, kp: np.ndarray, kd: np.ndarray) -> list[np.ndarray]:
         wanted = np.array([kp, kd])
         due = wanted != self._gains
-        due[:, self._turn % len(self._ids)] = True
+        due.flat[self._turn % due.size] = True
         self._turn += 1
         self._gains = wanted
         frames = []

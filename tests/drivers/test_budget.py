@@ -53,6 +53,16 @@ def test_standard_frames_with_eight_bytes(frames):
     assert frame_bits(made).tolist() == [slow_bits(id, bytes(data)) for id, data in frames]
 
 
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 0x1FFF_FFFF) | st.sampled_from([0, 0x1FFF_FFFF]), payloads), min_size=1, max_size=20
+    )
+)
+def test_extended_frames_with_eight_bytes(frames):
+    made = make_frames(np.array([id | EXTENDED for id, _ in frames]), np.array([data for _, data in frames], np.uint8))
+    assert frame_bits(made).tolist() == [slow_bits(id, bytes(data), True) for id, data in frames]
+
+
 @given(st.integers(0, 0x1FFF_FFFF), st.binary(max_size=8), st.booleans(), st.booleans())
 def test_every_other_kind_of_frame(id, data, extended, remote):
     id = id if extended else id & 0x7FF

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sim_robots import ARM_INERTIA
 
+from drivers.budget import budget
 from drivers.bus import BusError, MotorState
 from drivers.open import PROTOCOLS, open_codec
 from drivers.wire import EXTENDED, make_frames
@@ -141,6 +142,22 @@ def test_a_motor_that_loses_power_comes_back_disabled(tmp_path, protocol):
     state = bench.run(0.3, position=1.0, kp=2.0, kd=0.05)
     assert bench.torque[0] == 0.0 and bench.torque[1] != 0.0
     assert [e.event for e in bench.world.motor_log if e.joint == "left"][-1] == "powered on"
+
+
+def test_the_budget_is_what_goes_over_the_wire(tmp_path, protocol):
+    bench, rng, ticks = Bench(tmp_path, protocol), np.random.default_rng(5), 60
+    bench.enable()
+    gains = {"kp": [20.0, 35.0], "kd": [1.0, 2.3]}
+    bench.run(3 / RATE, **gains)
+    before = bench.world.counters()["arm"]
+    for _ in range(ticks):
+        bench.run(1 / RATE, position=rng.uniform(-1, 1, 2), torque=rng.uniform(-1, 1, 2), **gains)
+    after = bench.world.counters()["arm"]
+    expected = budget(bench.spec, RATE)
+    bits = (after["busy"] - before["busy"]) * bench.spec.bitrate / ticks
+    assert bits == pytest.approx(expected.bits, rel=0.08) and bits < expected.bits_worst
+    if expected.frames == 4:  # a command and an answer for each motor, and nothing else
+        assert (after["frames"] - before["frames"]) / ticks == pytest.approx(expected.frames, rel=0.08)
 
 
 def test_same_seed_same_bytes(tmp_path, protocol):
