@@ -157,11 +157,13 @@ def _cameras(clip: Clip) -> list[tuple[int, mujoco.MjvCamera]]:
     at = smooth(clip.base_position_in_world, clip.fps / 3)
     w, x, y, z = clip.base_orientation_in_world[0]
     yaw = np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    tall = 0.85 if clip.header.body == "human" and clip.header.length_scale == 1 else 0.65
+    thrown = clip.header.has_ball and clip.ball_position_in_world[:, 2].max() > 2 * tall
+    height = 1.3 * tall if thrown else tall
     shots = []
     for t in np.arange(0, len(clip), clip.fps / FPS).astype(int):
         camera = mujoco.MjvCamera()
-        height = 0.85 if clip.header.body == "human" and clip.header.length_scale == 1 else 0.65
-        camera.lookat[:] = at[t, 0], at[t, 1], height
+        camera.lookat[:] = *at[t, :2], height
         camera.azimuth, camera.elevation, camera.distance = yaw + 145, -12, 3.6 * height
         shots.append((int(t), camera))
     return shots
