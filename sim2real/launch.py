@@ -7,6 +7,7 @@ the motors' own watchdogs are what is left.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
@@ -28,7 +29,7 @@ from sim2real.guardian import operator_layout
 from sim2real.operators import Operator, store
 from sim2real.pilot import layout_of
 from sim2real.records import tick_layout
-from sim2real.robot import open_robot
+from sim2real.robot import Robot, open_robot
 from sim2real.run import RunSpec, channel
 from sim2real.simulation import support
 from sim2real.skills import SkillPlayer, Stage
@@ -141,7 +142,7 @@ class Launch:
         self.world: Any = None
         self.since = -1.0
         self._inherit = [inherit] if inherit >= 0 else []
-        self._over = threading.Event()
+        self._heir = threading.Thread(target=self._last_will, daemon=True)
         self._standing_by = self.clock.now()
 
     @property
@@ -171,11 +172,16 @@ class Launch:
 
             self._child("world", "sim2real.world").ready(20.0)
             self.world = WorldRemote(self.directory / "world.sock")
+        self._robot().close()  # rehearses the last will: everything is imported, every wire is there
         guardian = self._child("guardian", "sim2real.guardian")
         pilot = self._child("pilot", "sim2real.pilot")
         guardian.ready(20.0)
         pilot.ready(30.0)
-        threading.Thread(target=self._last_will, daemon=True).start()
+        self._heir.start()
+
+    def _robot(self) -> Robot:
+        directory = str(self.directory) if self.simulated else None
+        return open_robot(self.config, self.config.wiring(self.wiring), simulated_in=directory)
 
     def _child(self, name: str, module: str) -> Child:
         child = self.children[name] = Child(module, self.directory, [] if name == "world" else self._inherit)
@@ -228,28 +234,26 @@ class Launch:
             self.messages += [f"recorder: {text}" for text in self.recorder.poll()]
 
     def _last_will(self) -> None:
-        """If the guardian ends other than regularly, damp the robot from here."""
+        """If the guardian ends other than regularly, damp the robot from here for longer than any fall takes."""
         process = self.children["guardian"].process
-        if process.wait() == 0 or self._over.is_set():
+        if self.tune:
+            with contextlib.suppress(OSError, AttributeError):  # of this thread alone
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(60))
+        if process.wait() == 0:
             return
-        self.messages.append(f"guardian: died (exit {process.returncode}); damping from the launcher")
-        n = len(self.config.joint_names)
-        zero = np.zeros(n)
-        robot = open_robot(
-            self.config,
-            self.config.wiring(self.wiring),
-            simulated_in=str(self.directory) if self.simulated else None,
-        )
+        robot = self._robot()
+        zero = np.zeros(len(self.config.joint_names))
         anywhere = np.clip(zero, self.config.position_min, self.config.position_max)  # kp is 0
         damp = JointCommand(0.0, anywhere, zero, zero, zero, self.config.damping)
         schedule = Schedule(self.clock, 0.005)
         schedule.start(self.clock.now())
-        for _ in range(400):  # 2 s: longer than any fall
-            schedule.wait()
-            try:
+        self.messages.append(f"guardian: died (exit {process.returncode}); damping from the launcher")
+        try:
+            for _ in range(400):
+                schedule.wait()
                 robot.write(damp)
-            except Exception as error:  # noqa: BLE001 - go on with the buses that still work
-                self.messages.append(str(error))
+        except Exception as error:  # noqa: BLE001 - then off is what is left
+            self.messages.append(f"last will: {error}")
         robot.disable()
         robot.close()
 
@@ -257,17 +261,11 @@ class Launch:
         for name in ("pilot", "guardian"):
             if name in self.children:
                 child = self.children[name]
-                if name == "guardian" and child.process.poll() not in (None, 0):
-                    self._wait_for_will()
                 child.end(5.0)
-        self._over.set()
+        if self._heir.ident is not None:
+            self._heir.join(5.0)
         self._listen()
         if "world" in self.children:
             self.children["world"].end(3.0)
         self.operator.close()
         shutil.rmtree(self.directory, ignore_errors=True)
-
-    def _wait_for_will(self) -> None:
-        for thread in threading.enumerate():
-            if thread.name.endswith("(_last_will)"):
-                thread.join(5.0)

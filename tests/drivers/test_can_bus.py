@@ -233,10 +233,17 @@ def test_other_traffic_while_connecting_does_no_harm():
 
 def test_nothing_is_sent_before_connecting():
     bus, wire, _ = made(connect=False)
-    for act in (bus.poll, bus.enable, lambda: bus.write(command())):
+    for act in (bus.poll, bus.enable, lambda: bus.write(command(kp=np.ones(3)))):
         with pytest.raises(BusError, match="bus leg: not connected; call connect"):
             act()
     assert wire.sent == []
+
+
+def test_damping_needs_no_connecting():
+    """It is what a process sends to motors that another one, now dead, had connected."""
+    bus, wire, _ = made(connect=False)
+    bus.write(command(kd=np.ones(3)))
+    assert len(np.concatenate(wire.sent)) == 3
 
 
 # One tick
@@ -367,7 +374,7 @@ def test_enabling_half_a_bus_is_an_error():
 def test_a_wire_that_is_gone_is_a_bus_error():
     bus, wire, _ = made()
     wire.refuse = refuse(WireError("Network is down"))
-    for act in (bus.poll, bus.enable, lambda: bus.write(command())):
+    for act in (bus.poll, bus.enable, lambda: bus.write(command(kp=np.ones(3)))):
         with pytest.raises(BusError, match=r"bus leg \(socketcan can7\): Network is down"):
             act()
     wire.recv = refuse_recv

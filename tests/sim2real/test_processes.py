@@ -64,6 +64,7 @@ def kill_and_watch(launch, name: str) -> dict:
         safe = [e for e in world.motor_log if e.event in ("damping", "watchdog") and e.time > before["time"]]
         seen["after"] = {e.joint: e.time - before["time"] for e in reversed(safe)}  # the first of each joint
         seen["events"] = {e.event for e in safe}
+        seen["first"] = {e.joint: e.event for e in reversed(safe)}
         seen["mode"] = launch.mode
         world.close()
         launch.children["guardian"].process.terminate()
@@ -86,6 +87,8 @@ def test_a_killed_pilot_leaves_every_motor_damping_in_time(launch):
 def test_a_killed_guardian_is_replaced_by_the_last_will(launch):
     seen = kill_and_watch(launch, "guardian")
     assert any("guardian: died" in m for m in seen["summary"].messages)
+    assert not any("last will" in m for m in seen["summary"].messages)
+    assert set(seen["first"].values()) == {"damping"}  # before any motor's own watchdog
     assert set(seen["after"]) == set(launch.config.joint_names)
     assert max(seen["after"].values()) < PROMISE
 
