@@ -1,0 +1,59 @@
+"""A simulated camera on the robot: sees the ball of a simulated world at its own rate, late, noisily, and not always."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sim2real.tracker import ObjectSample, rotate
+
+if TYPE_CHECKING:
+    from drivers.sim.world import World
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """What a camera with a detector is like; the defaults are those of a global-shutter camera with a small network."""
+
+    rate: float = 60.0  # Hz
+    latency: float = 0.035  # s from exposure to answer
+    jitter: float = 0.01  # s more, uniform
+    noise: float = 0.006  # m, standard deviation on each axis
+    loss: float = 0.05  # share of exposures without an answer
+
+
+class SimCamera:
+    """``expose`` at least as often as ``model.rate``; ``read(now)`` gives what has arrived by then."""
+
+    def __init__(self, model: CameraModel | None = None, seed: int = 0) -> None:
+        self.model = model or CameraModel()
+        self._rng = np.random.default_rng(seed)
+        self._next = -np.inf
+        self._coming: deque[tuple[float, ObjectSample]] = deque()
+
+    def expose(self, now: float, position: np.ndarray, base: np.ndarray, orientation: np.ndarray) -> None:
+        """Perhaps take a picture: object and base (3,) m and the base's orientation (4,), in the world, at ``now`` s."""
+        if now < self._next - 1e-9:
+            return
+        m, rng = self.model, self._rng
+        self._next = (now if self._next == -np.inf else self._next) + 1 / m.rate
+        lost, delay = rng.random() < m.loss, m.latency + m.jitter * rng.random()
+        seen = rotate(orientation * [1.0, -1.0, -1.0, -1.0], position - base) + m.noise * rng.standard_normal(3)
+        if not lost:
+            self._coming.append((now + delay, ObjectSample(now, seen)))
+
+    def read(self, now: float) -> list[ObjectSample]:
+        """Samples that have arrived by ``now`` (s), in the order of their exposure."""
+        found = []
+        while self._coming and self._coming[0][0] <= now:
+            found.append(self._coming.popleft()[1])
+        return found
+
+    def watch(self, world: World, name: str = "ball") -> None:
+        """Perhaps take a picture of the body ``name`` of a simulated world."""
+        truth = world.truth()
+        position = world.plant.data.body(name).xpos
+        self.expose(world.time, position.copy(), truth.position_base_in_world, truth.orientation_base_in_world)
