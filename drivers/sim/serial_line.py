@@ -19,8 +19,7 @@ from dataclasses import dataclass
 from heapq import heappop, heappush
 
 from drivers.bus import BusSpec
-from drivers.codecs import dynamixel
-from drivers.codecs.dynamixel import Packet, Parser
+from drivers.codecs.dynamixel_packet import BROADCAST, Packet, Parser, pack_status
 from drivers.serial_bus import BITS_PER_BYTE
 from drivers.sim.faults import HOST, POWER, Fault
 from drivers.sim.servo import SimServos
@@ -162,7 +161,7 @@ class SerialLine:
     def _lie(self, kind: str, row: int, answer: bytes) -> bytes:
         """An answer with another payload, and a CRC that fits."""
         said = Parser().feed(answer)
-        if not said or said[0].id == dynamixel.BROADCAST:
+        if not said or said[0].id == BROADCAST:
             return answer
         payload = bytearray(said[0].parameters)
         if kind == "garbage":
@@ -172,7 +171,7 @@ class SerialLine:
         elif len(payload) > 1:
             at = self._random.randrange(8, 8 * len(payload))
             payload[at // 8] ^= 1 << at % 8
-        return dynamixel.pack_status(said[0].id, payload[0], bytes(payload[1:]))
+        return pack_status(said[0].id, payload[0], bytes(payload[1:]))
 
     def _collide(self, start: float, part: bytearray) -> None:
         """Garble what the host sends while a servo speaks, and what that says."""

@@ -23,18 +23,16 @@ from drivers.bus import BusError, BusSpec
 from drivers.codecs import dynamixel
 from drivers.codecs.dynamixel import (
     ALERT,
-    BROADCAST,
     INDIRECT_ADDRESS,
     INDIRECT_DATA,
     RAM,
     REGISTERS,
     TICK,
     ZERO,
-    Instruction,
-    Packet,
     Register,
     StatusError,
 )
+from drivers.codecs.dynamixel_packet import BROADCAST, HEADER, Instruction, Packet, crc16, pack_status
 from drivers.sim.motor import AMBIENT, RATED_SHARE, ROTOR_RISE, ROTOR_TIME, THERMAL_PERIOD, Body, MotorEvent
 
 TABLE_SIZE = 256
@@ -204,7 +202,7 @@ class SimServos:
     def _answer_fast(self, asked: list[tuple[int, int, int]], time: float) -> tuple[int, float, bytes] | None:
         """One status packet from all; a silent servo ends it there."""
         length = 1 + sum(size + 4 for _, _, size in asked)
-        raw = dynamixel.HEADER + bytes([BROADCAST]) + length.to_bytes(2, "little") + bytes([Instruction.STATUS])
+        raw = HEADER + bytes([BROADCAST]) + length.to_bytes(2, "little") + bytes([Instruction.STATUS])
         first = -1
         for id, address, size in asked:
             rows = self._addressed(id, time)
@@ -213,7 +211,7 @@ class SimServos:
                 break
             first = rows[0] if first < 0 else first
             raw += bytes([self._alert(rows[0]), id]) + data[0]
-            raw += dynamixel.crc16(raw).to_bytes(2, "little")
+            raw += crc16(raw).to_bytes(2, "little")
         return None if first < 0 else (first, self._delay(first), raw)
 
     def _write_group(self, packet: Packet, time: float) -> Iterator[tuple[int, float, bytes] | None]:
@@ -262,7 +260,7 @@ class SimServos:
         """``level``: the lowest status return level at which this is answered."""
         if self._get(row, "STATUS_RETURN_LEVEL") < level:
             return None
-        return row, self._delay(row), dynamixel.pack_status(self._get(row, "ID"), error | self._alert(row), data)
+        return row, self._delay(row), pack_status(self._get(row, "ID"), error | self._alert(row), data)
 
     def _alert(self, row: int) -> int:
         return ALERT if self._get(row, "HARDWARE_ERROR") else 0

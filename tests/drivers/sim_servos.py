@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from drivers.bus import BusSpec
-from drivers.codecs.dynamixel import DynamixelCodec, Packet, Parser
+from drivers.codecs.dynamixel import DynamixelCodec
+from drivers.codecs.dynamixel_packet import Packet, Parser
 from drivers.serial_bus import SerialBus
 from drivers.sim.faults import parse_fault
 from drivers.sim.serial_line import SerialLine, SerialLineWire

@@ -10,7 +10,24 @@ from hypothesis import strategies as st
 
 from drivers.bus import BusError, BusSpec, MotorCommand, MotorSpec, MotorState
 from drivers.codecs import dynamixel
-from drivers.codecs.dynamixel import BROADCAST, DynamixelCodec, Instruction, Parser
+from drivers.codecs.dynamixel import DynamixelCodec
+from drivers.codecs.dynamixel_packet import (
+    BROADCAST,
+    LENGTH_MAX,
+    Instruction,
+    Parser,
+    crc16,
+    pack,
+    pack_bulk_read,
+    pack_bulk_write,
+    pack_read,
+    pack_status,
+    pack_sync_read,
+    pack_sync_write,
+    pack_write,
+    stuff,
+    unstuff,
+)
 
 # Bytes among which headers and stuffing are frequent.
 AWKWARD = st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x01, 0x55]), max_size=60).map(bytes)
@@ -32,27 +49,27 @@ def status(id: int, *fields: int, alert: int = 0) -> bytes:
 
 
 GOLDEN = {
-    "ping": (dynamixel.pack(1, Instruction.PING), "FF FF FD 00 01 03 00 01 19 4E"),
-    "ping status": (dynamixel.pack_status(1, 0, bytes([6, 4, 0x26])), "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D"),
+    "ping": (pack(1, Instruction.PING), "FF FF FD 00 01 03 00 01 19 4E"),
+    "ping status": (pack_status(1, 0, bytes([6, 4, 0x26])), "FF FF FD 00 01 07 00 55 00 06 04 26 65 5D"),
     "sync read": (
-        dynamixel.pack_sync_read(bytes([1, 2]), 132, 4),
+        pack_sync_read(bytes([1, 2]), 132, 4),
         "FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA",
     ),
     "sync write": (
-        dynamixel.pack_sync_write(116, bytes([1, 150, 0, 0, 0, 2, 170, 0, 0, 0]), 4),
+        pack_sync_write(116, bytes([1, 150, 0, 0, 0, 2, 170, 0, 0, 0]), 4),
         "FF FF FD 00 FE 11 00 83 74 00 04 00 01 96 00 00 00 02 AA 00 00 00 82 87",
     ),
     "bulk read": (
-        dynamixel.pack_bulk_read([(1, 144, 2), (2, 146, 1)]),
+        pack_bulk_read([(1, 144, 2), (2, 146, 1)]),
         "FF FF FD 00 FE 0D 00 92 01 90 00 02 00 02 92 00 01 00 1A 05",
     ),
-    "reboot": (dynamixel.pack(1, Instruction.REBOOT), "FF FF FD 00 01 03 00 08 2F 4E"),
+    "reboot": (pack(1, Instruction.REBOOT), "FF FF FD 00 01 03 00 08 2F 4E"),
     "clear": (
-        dynamixel.pack(1, Instruction.CLEAR, bytes([0x01, 0x44, 0x58, 0x4C, 0x22])),
+        pack(1, Instruction.CLEAR, bytes([0x01, 0x44, 0x58, 0x4C, 0x22])),
         "FF FF FD 00 01 08 00 10 01 44 58 4C 22 B1 DC",
     ),
     "stuffed sync write": (
-        dynamixel.pack_sync_write(102, b"\x01" + np.int16(-1).tobytes() + np.int32(-3).tobytes(), 6),
+        pack_sync_write(102, b"\x01" + np.int16(-1).tobytes() + np.int32(-3).tobytes(), 6),
         "FF FF FD 00 FE 0F 00 83 66 00 06 00 01 FF FF FD FD FF FF FF 67 DC",
     ),
 }
@@ -62,34 +79,34 @@ GOLDEN = {
 def test_golden_bytes(packed, expected):
     assert packed.hex(" ").upper() == expected
     (packet,) = Parser().feed(packed)
-    assert dynamixel.pack(packet.id, packet.instruction, packet.parameters) == packed
+    assert pack(packet.id, packet.instruction, packet.parameters) == packed
 
 
 @given(st.one_of(st.binary(max_size=120), AWKWARD))
 def test_crc_and_stuffing_are_the_reference(data):
-    assert dynamixel.crc16(data) == reference.crc16(data)
-    assert dynamixel.stuff(data) == reference.stuff(data)
-    assert dynamixel.unstuff(dynamixel.stuff(data)) == data
+    assert crc16(data) == reference.crc16(data)
+    assert stuff(data) == reference.stuff(data)
+    assert unstuff(stuff(data)) == data
 
 
 @given(st.integers(0, 252), st.sampled_from([0x01, 0x03, 0x55, 0x83]), st.one_of(st.binary(max_size=80), AWKWARD))
 def test_every_packet_comes_back(id, instruction, parameters):
-    raw = dynamixel.pack(id, instruction, parameters)
+    raw = pack(id, instruction, parameters)
     assert raw == reference.pack(id, instruction, parameters)
     (packet,) = Parser().feed(raw)
     assert (packet.id, packet.instruction, packet.parameters, packet.end) == (id, instruction, parameters, len(raw))
 
 
 def test_longest_packet_is_refused():
-    dynamixel.pack(1, 3, bytes(dynamixel.LENGTH_MAX - 3))
+    pack(1, 3, bytes(LENGTH_MAX - 3))
     with pytest.raises(ValueError, match="at most 1024"):
-        dynamixel.pack(1, 3, bytes(dynamixel.LENGTH_MAX - 2))
+        pack(1, 3, bytes(LENGTH_MAX - 2))
 
 
 def test_read_write_and_bulk_write_name_address_and_size():
-    assert dynamixel.pack_read(7, 132, 4) == reference.pack(7, 2, bytes([132, 0, 4, 0]))
-    assert dynamixel.pack_write(7, 0x0274, b"ab") == reference.pack(7, 3, bytes([0x74, 2]) + b"ab")
-    assert dynamixel.pack_bulk_write([(1, 116, b"abcd"), (2, 64, b"\1")]) == reference.pack(
+    assert pack_read(7, 132, 4) == reference.pack(7, 2, bytes([132, 0, 4, 0]))
+    assert pack_write(7, 0x0274, b"ab") == reference.pack(7, 3, bytes([0x74, 2]) + b"ab")
+    assert pack_bulk_write([(1, 116, b"abcd"), (2, 64, b"\1")]) == reference.pack(
         BROADCAST, 0x93, bytes([1, 116, 0, 4, 0]) + b"abcd" + bytes([2, 64, 0, 1, 0, 1])
     )
 
@@ -99,7 +116,7 @@ def test_read_write_and_bulk_write_name_address_and_size():
 
 @given(st.lists(AWKWARD, min_size=1, max_size=5), AWKWARD, st.data())
 def test_packets_are_found_however_the_stream_is_cut(payloads, noise, data):
-    packets = [dynamixel.pack(k + 1, Instruction.STATUS, b"\0" + p) for k, p in enumerate(payloads)]
+    packets = [pack(k + 1, Instruction.STATUS, b"\0" + p) for k, p in enumerate(payloads)]
     stream = noise.replace(b"\xff", b"\xfe") + b"".join(packets)
     parser, found, at = Parser(), [], 0
     while at < len(stream):
@@ -289,7 +306,7 @@ def test_one_damaged_answer_does_not_lose_the_others(damage):
 
 def test_strangers_and_short_answers_are_rejected():
     codec, state = DynamixelCodec(bus(2)), MotorState.empty(2)
-    assert codec.unpack(status(9, 1, 0, 4, 0, 0, 0, 0) + dynamixel.pack_status(1, 0, b"abc"), state, 1.0) == 0
+    assert codec.unpack(status(9, 1, 0, 4, 0, 0, 0, 0) + pack_status(1, 0, b"abc"), state, 1.0) == 0
     assert codec.rejected == 2 and (state.time == -np.inf).all()
 
 

@@ -10,6 +10,7 @@ from test_dynamixel import command
 from drivers.bus import BusError, MotorSpec
 from drivers.codecs import dynamixel
 from drivers.codecs.dynamixel import DynamixelCodec
+from drivers.codecs.dynamixel_packet import pack_write
 from drivers.serial_bus import FAST_FAILURES, REPLY_MARGIN, SerialBus
 from drivers.sim.serial_pty import bus_of
 from drivers.wire import WireError, WireFull
@@ -106,7 +107,7 @@ def test_nothing_goes_out_before_connecting():
 
 def test_a_servo_that_was_enabled_by_somebody_else_is_off_after_connecting():
     bench = Bench(2)
-    bench.ask(dynamixel.pack_write(1, 64, b"\1"))
+    bench.ask(pack_write(1, 64, b"\1"))
     assert bench.servos.register("servo_1", "TORQUE_ENABLE") == 1
     assert not bench.connected().read(bench.time).enabled.any()
 

@@ -13,7 +13,18 @@ from sim_servos import Bench
 
 from drivers.bus import BusError
 from drivers.codecs import dynamixel
-from drivers.codecs.dynamixel import ALERT, BROADCAST, REGISTERS, Instruction, StatusError
+from drivers.codecs.dynamixel import ALERT, REGISTERS, StatusError
+from drivers.codecs.dynamixel_packet import (
+    BROADCAST,
+    Instruction,
+    pack,
+    pack_bulk_read,
+    pack_bulk_write,
+    pack_read,
+    pack_status,
+    pack_sync_read,
+    pack_write,
+)
 from drivers.sim.serial_pty import bus_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,13 +35,13 @@ def write(bench: Bench, register: str, value: int, id: int = 1) -> int:
     """Write a register; returns the error byte of the answer."""
     r = REGISTERS[register]
     raw = (value & (1 << 8 * r.size) - 1).to_bytes(r.size, "little")
-    (answer,) = bench.ask(dynamixel.pack_write(id, r.address, raw))
+    (answer,) = bench.ask(pack_write(id, r.address, raw))
     return answer.parameters[0]
 
 
 def read(bench: Bench, register: str, id: int = 1) -> int:
     r = REGISTERS[register]
-    (answer,) = bench.ask(dynamixel.pack_read(id, r.address, r.size))
+    (answer,) = bench.ask(pack_read(id, r.address, r.size))
     return int.from_bytes(answer.parameters[1:], "little", signed=r.low < 0)
 
 
@@ -42,12 +53,12 @@ def ids(answers) -> list[int]:
 
 
 def test_ping_tells_model_and_firmware():
-    (answer,) = Bench(2).ask(dynamixel.pack(2, Instruction.PING))
-    assert answer.raw == dynamixel.pack_status(2, 0, (1020).to_bytes(2, "little") + bytes([45]))
+    (answer,) = Bench(2).ask(pack(2, Instruction.PING))
+    assert answer.raw == pack_status(2, 0, (1020).to_bytes(2, "little") + bytes([45]))
 
 
 def test_everybody_answers_a_broadcast_ping():
-    assert ids(Bench(3).ask(dynamixel.pack(BROADCAST, Instruction.PING))) == [1, 2, 3]
+    assert ids(Bench(3).ask(pack(BROADCAST, Instruction.PING))) == [1, 2, 3]
 
 
 def test_eeprom_is_locked_while_torque_is_on():
@@ -81,24 +92,24 @@ def test_what_cannot_be_written_is_refused_and_stays(register, value, error):
 
 def test_a_write_that_is_refused_in_part_is_refused_whole():
     bench = Bench(1)
-    (answer,) = bench.ask(dynamixel.pack_write(1, 80, np.array([1, 2, 20000], "<u2").tobytes()))
+    (answer,) = bench.ask(pack_write(1, 80, np.array([1, 2, 20000], "<u2").tobytes()))
     assert answer.parameters[0] == StatusError.DATA_RANGE and read(bench, "POSITION_D_GAIN") == 0
 
 
 def test_unknown_instructions_and_short_requests_are_answered_with_an_error():
     bench = Bench(1)
-    assert bench.ask(dynamixel.pack(1, 0x42))[0].parameters == bytes([StatusError.INSTRUCTION])
-    assert bench.ask(dynamixel.pack(1, Instruction.READ, b"ab"))[0].parameters == bytes([StatusError.DATA_LENGTH])
-    assert bench.ask(dynamixel.pack_read(1, 250, 10))[0].parameters == bytes([StatusError.DATA_RANGE])
+    assert bench.ask(pack(1, 0x42))[0].parameters == bytes([StatusError.INSTRUCTION])
+    assert bench.ask(pack(1, Instruction.READ, b"ab"))[0].parameters == bytes([StatusError.DATA_LENGTH])
+    assert bench.ask(pack_read(1, 250, 10))[0].parameters == bytes([StatusError.DATA_RANGE])
 
 
 def test_indirect_registers_stand_for_others_both_ways():
     bench = Bench(1)
     write(bench, "INDIRECT", dynamixel.INDIRECT_VALUE)
-    (answer,) = bench.ask(dynamixel.pack_write(1, dynamixel.GOAL_AT, (77).to_bytes(2, "little") + bytes([1, 2, 0, 0])))
+    (answer,) = bench.ask(pack_write(1, dynamixel.GOAL_AT, (77).to_bytes(2, "little") + bytes([1, 2, 0, 0])))
     assert answer.parameters[0] == 0
     assert read(bench, "POSITION_P_GAIN") == 77 and read(bench, "GOAL_POSITION") == 0x201
-    (answer,) = bench.ask(dynamixel.pack_read(1, dynamixel.STATE_AT, dynamixel.STATE_SIZE))
+    (answer,) = bench.ask(pack_read(1, dynamixel.STATE_AT, dynamixel.STATE_SIZE))
     item = np.frombuffer(answer.parameters[1:], dynamixel.STATE_ITEM)[0]
     assert item["position"] == 2048 and item["temperature"] == 25
 
@@ -106,9 +117,9 @@ def test_indirect_registers_stand_for_others_both_ways():
 def test_reg_write_waits_for_action():
     bench = Bench(2)
     for id in (1, 2):
-        bench.ask(dynamixel.pack(id, Instruction.REG_WRITE, bytes([116, 0, 0, 1, 0, 0])))
+        bench.ask(pack(id, Instruction.REG_WRITE, bytes([116, 0, 0, 1, 0, 0])))
     assert read(bench, "GOAL_POSITION") == 0
-    assert bench.ask(dynamixel.pack(BROADCAST, Instruction.ACTION)) == []
+    assert bench.ask(pack(BROADCAST, Instruction.ACTION)) == []
     assert (read(bench, "GOAL_POSITION"), read(bench, "GOAL_POSITION", 2)) == (256, 256)
 
 
@@ -118,9 +129,9 @@ def test_status_return_level_says_what_is_answered(level, answers):
     said = [
         len(bench.ask(raw))
         for raw in (
-            dynamixel.pack(1, Instruction.PING),
-            dynamixel.pack_read(1, 0, 2),
-            dynamixel.pack_write(1, 65, b"\1"),
+            pack(1, Instruction.PING),
+            pack_read(1, 0, 2),
+            pack_write(1, 65, b"\1"),
         )
     ]
     assert tuple(said) == answers
@@ -129,8 +140,8 @@ def test_status_return_level_says_what_is_answered(level, answers):
 def test_a_changed_id_is_where_it_listens_from_then_on():
     bench = Bench(1)
     assert write(bench, "ID", 9) == 0
-    assert ids(bench.ask(dynamixel.pack(1, Instruction.PING))) == []
-    assert ids(bench.ask(dynamixel.pack(9, Instruction.PING))) == [9]
+    assert ids(bench.ask(pack(1, Instruction.PING))) == []
+    assert ids(bench.ask(pack(9, Instruction.PING))) == [9]
 
 
 def test_registers_of_joints_that_are_not_there_are_refused():
@@ -194,7 +205,7 @@ def test_traffic_for_another_servo_feeds_the_watchdog():
     write(bench, "TORQUE_ENABLE", 1)
     write(bench, "BUS_WATCHDOG", 3)
     for _ in range(10):
-        bench.ask(dynamixel.pack(2, Instruction.PING), 0.03)
+        bench.ask(pack(2, Instruction.PING), 0.03)
     assert read(bench, "BUS_WATCHDOG") == 3
     bench.wait(0.07)
     assert read(bench, "BUS_WATCHDOG") == 255
@@ -206,8 +217,8 @@ def test_a_shutdown_error_takes_torque_off_until_a_reboot():
     bench.servos.fail("servo_1", 0x20, bench.time)
     assert read(bench, "TORQUE_ENABLE") == 0 and read(bench, "HARDWARE_ERROR") == 0x20
     assert write(bench, "TORQUE_ENABLE", 1) == StatusError.RESULT_FAIL | ALERT
-    assert bench.ask(dynamixel.pack(1, Instruction.REBOOT))[0].parameters[0] == ALERT
-    assert bench.ask(dynamixel.pack(1, Instruction.PING)) == [], "it is booting"
+    assert bench.ask(pack(1, Instruction.REBOOT))[0].parameters[0] == ALERT
+    assert bench.ask(pack(1, Instruction.PING)) == [], "it is booting"
     bench.wait(0.4)
     assert read(bench, "HARDWARE_ERROR") == 0 and write(bench, "TORQUE_ENABLE", 1) == 0
 
@@ -217,7 +228,7 @@ def test_an_error_that_is_not_in_shutdown_is_only_told():
     write(bench, "TORQUE_ENABLE", 1)
     bench.servos.fail("servo_1", 0x01, bench.time)
     assert read(bench, "TORQUE_ENABLE") == 1
-    assert bench.ask(dynamixel.pack(1, Instruction.PING))[0].parameters[0] == ALERT
+    assert bench.ask(pack(1, Instruction.PING))[0].parameters[0] == ALERT
 
 
 def test_a_servo_that_stalls_overheats():
@@ -235,13 +246,13 @@ def test_turns_do_not_survive_power_and_can_be_cleared():
     bench.wait(0.002)
     assert read(bench, "PRESENT_POSITION") == 7048
     bench.servos.power(0, False, bench.time)
-    assert bench.ask(dynamixel.pack(1, Instruction.PING)) == []
+    assert bench.ask(pack(1, Instruction.PING)) == []
     bench.servos.power(0, True, bench.time)
     bench.wait(0.4)
     assert read(bench, "PRESENT_POSITION") == 7048 - 4096
     bench.body.joint_pos[:] += 4096 * TICK
     bench.wait(0.002)
-    clear = dynamixel.pack(1, Instruction.CLEAR, bytes([0x01, 0x44, 0x58, 0x4C, 0x22]))
+    clear = pack(1, Instruction.CLEAR, bytes([0x01, 0x44, 0x58, 0x4C, 0x22]))
     assert bench.ask(clear)[0].parameters == b"\0" and read(bench, "PRESENT_POSITION") == 7048 - 4096
     write(bench, "TORQUE_ENABLE", 1)
     assert bench.ask(clear)[0].parameters == bytes([StatusError.RESULT_FAIL])
@@ -252,24 +263,24 @@ def test_turns_do_not_survive_power_and_can_be_cleared():
 
 def test_answers_come_in_the_order_of_the_request():
     bench = Bench(4)
-    assert ids(bench.ask(dynamixel.pack_sync_read(bytes([3, 1, 4]), 132, 4))) == [3, 1, 4]
-    bulk = bench.ask(dynamixel.pack_bulk_read([(2, 144, 2), (1, 146, 1)]))
+    assert ids(bench.ask(pack_sync_read(bytes([3, 1, 4]), 132, 4))) == [3, 1, 4]
+    bulk = bench.ask(pack_bulk_read([(2, 144, 2), (1, 146, 1)]))
     assert [(a.id, a.parameters[1:]) for a in bulk] == [(2, bytes([120, 0])), (1, bytes([25]))]
-    assert bench.ask(dynamixel.pack_bulk_write([(2, 65, b"\1"), (3, 116, bytes([9, 0, 0, 0]))])) == []
+    assert bench.ask(pack_bulk_write([(2, 65, b"\1"), (3, 116, bytes([9, 0, 0, 0]))])) == []
     assert read(bench, "LED", 2) == 1 and read(bench, "GOAL_POSITION", 3) == 9
 
 
 @pytest.mark.parametrize("patient, answer", [(False, [1]), (True, [1, 3])])
 def test_those_behind_a_silent_servo_wait_for_it(patient, answer):
     bench = Bench(3, faults=("off:servos/servo_2",), patient=patient)
-    assert ids(bench.ask(dynamixel.pack_sync_read(bytes([1, 2, 3]), 132, 4))) == answer
+    assert ids(bench.ask(pack_sync_read(bytes([1, 2, 3]), 132, 4))) == answer
 
 
 @pytest.mark.parametrize("delay", [0, 250])
 def test_the_time_of_every_byte(delay):
     """10 bits a byte; the adapter either way; each servo's gap and return delay (in 2 us) behind the one before."""
     bench = Bench(2, registers={j: {"RETURN_DELAY": delay} for j in ("servo_1", "servo_2")}, latency=300e-6, gap=20e-6)
-    request = dynamixel.pack_sync_read(bytes([1, 2]), 132, 4)
+    request = pack_sync_read(bytes([1, 2]), 132, 4)
     byte = 10 / 4e6
     first = 300e-6 + len(request) * byte + 20e-6 + delay * 2e-6 + 15 * byte + 300e-6
     second = first + 20e-6 + delay * 2e-6 + 15 * byte
@@ -286,9 +297,9 @@ def test_the_time_of_every_byte(delay):
 
 def test_who_speaks_while_another_does_garbles_both():
     bench = Bench(2)
-    bench.wire.write(dynamixel.pack_sync_read(bytes([1, 2]), 132, 4))
+    bench.wire.write(pack_sync_read(bytes([1, 2]), 132, 4))
     bench.wait(0.00004)
-    bench.wire.write(dynamixel.pack_write(1, 65, b"\1"))
+    bench.wire.write(pack_write(1, 65, b"\1"))
     bench.wait(0.01)
     assert len(bench._parser.feed(bench.wire.read())) < 2
     assert bench.line.traffic.collisions > 0 and read(bench, "LED") == 0
@@ -301,29 +312,29 @@ def test_who_speaks_while_another_does_garbles_both():
 )  # fmt: skip
 def test_faults_befall_whom_they_name(fault, heard):
     bench = Bench(2, faults=(fault,))
-    answers = bench.ask(dynamixel.pack(1, Instruction.PING))
+    answers = bench.ask(pack(1, Instruction.PING))
     assert ids(answers) == heard
 
 
 @pytest.mark.parametrize("kind", ["garbage", "wrong", "stuck"])
 def test_lies_have_a_good_crc(kind):
     bench = Bench(1, faults=(f"{kind}:servos/servo_1@0.1",))
-    truth = bench.ask(dynamixel.pack_read(1, 128, 8))[0].parameters
+    truth = bench.ask(pack_read(1, 128, 8))[0].parameters
     bench.sleep_until(0.1)
     if kind == "stuck":
-        bench.ask(dynamixel.pack_read(1, 128, 8))
+        bench.ask(pack_read(1, 128, 8))
         bench.body.joint_pos[:] = 1.0
         bench.wait(0.002)
-        assert bench.ask(dynamixel.pack_read(1, 128, 8))[0].parameters == truth
+        assert bench.ask(pack_read(1, 128, 8))[0].parameters == truth
     else:
-        assert bench.ask(dynamixel.pack_read(1, 128, 8))[0].parameters != truth
+        assert bench.ask(pack_read(1, 128, 8))[0].parameters != truth
 
 
 def test_a_reboot_fault_takes_power_away_for_a_while():
     bench = Bench(1, faults=("reboot:servos/servo_1=0.2@0.1",))
     write(bench, "TORQUE_ENABLE", 1)
     bench.sleep_until(0.15)
-    assert bench.ask(dynamixel.pack(1, Instruction.PING)) == []
+    assert bench.ask(pack(1, Instruction.PING)) == []
     bench.sleep_until(0.7)
     assert read(bench, "TORQUE_ENABLE") == 0
     assert [e.event for e in bench.servos.log] == ["enabled", "powered off", "powered on"]

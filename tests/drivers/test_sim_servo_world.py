@@ -9,6 +9,7 @@ from test_dynamixel import command
 
 from drivers.budget import budget
 from drivers.bus import BusError, BusSpec, MotorSpec
+from drivers.codecs.dynamixel_packet import Instruction, pack, pack_status
 from drivers.open import open_bus, open_world
 from drivers.sim.serial_world import SerialWorld
 
@@ -129,11 +130,10 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
 def test_a_port_carries_bytes_to_another_process(tmp_path):
     rig = Rig(tmp_path)
     (port,) = rig.world.ports.values()
-    from drivers.codecs import dynamixel
 
-    assert port.hear(dynamixel.pack(2, dynamixel.Instruction.PING), rig.world.time) == b""
+    assert port.hear(pack(2, Instruction.PING), rig.world.time) == b""
     rig.world.advance(rig.world.time + 0.004)
-    assert port.give(rig.world.time) == dynamixel.pack_status(2, 0, (1020).to_bytes(2, "little") + bytes([45]))
+    assert port.give(rig.world.time) == pack_status(2, 0, (1020).to_bytes(2, "little") + bytes([45]))
 
 
 def test_the_budget_counts_the_packets_around_all_servos():
