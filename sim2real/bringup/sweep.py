@@ -1,0 +1,169 @@
+"""Who is on a bus: every identifier is asked, and what answers is read out. Nothing is enabled, written or commanded.
+
+Two motors with one identifier both answer. Where they say the same, at the same moment, a CAN bus shows one frame; so each
+is asked for what differs between motors (serial number, position), and answers that disagree, come twice, or garble each
+other into error frames give them away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from drivers.bus import BusSpec, Clock
+from drivers.codecs import damiao
+from drivers.codecs.damiao import Operation
+from drivers.wire import ERROR, CanWire, make_frames
+
+ANSWER_TIME = 0.01  # s for the answers to one batch of questions
+POLL_PERIOD = 0.001  # s between two looks at the wire
+BATCH = 16  # identifiers asked at once: what fits into a default queue twice over would not
+TRIES = 3
+# What is read of a Damiao motor; the first is what it is found by. SN differs between motors.
+REGISTERS = ("ESC_ID", "SN", "MST_ID", "CTRL_MODE", "TIMEOUT", "HW_VER", "SW_VER", "PMAX", "VMAX", "TMAX")
+TOLERANCE = 1e-4  # relative, of a range
+
+
+@dataclass
+class Found:
+    """A motor, or several with one identifier. ``registers``: what it says of itself."""
+
+    id: int
+    feedback_ids: set[int] = field(default_factory=set)  # identifiers of its answers
+    registers: dict[str, float] = field(default_factory=dict)
+    duplicate: bool = False
+    error: str = ""  # "": none
+
+    @property
+    def models(self) -> list[str]:
+        """The models that have its ranges."""
+        got = [self.registers.get(name, np.nan) for name in ("PMAX", "VMAX", "TMAX")]
+        return [m for m, ranges in damiao.MODELS.items() if np.allclose(got, ranges, rtol=TOLERANCE)]
+
+
+@dataclass
+class Sweep:
+    """What a sweep of one bus came to."""
+
+    motors: list[Found]
+    error_frames: int = 0
+
+
+def sweep_damiao(wire: CanWire, clock: Clock, ids: Iterable[int] = range(1, 0x100)) -> Sweep:
+    """Every Damiao motor among ``ids``. Takes about ANSWER_TIME * TRIES for each BATCH of them. Raises WireError."""
+    swept = Sweep([])
+    found: dict[int, Found] = {}
+    ids = list(ids)
+    for batch in (ids[i : i + BATCH] for i in range(0, len(ids), BATCH)):
+        missing = batch
+        for _ in range(TRIES):
+            _read(wire, clock, missing, "ESC_ID", found, swept)
+            missing = [id for id in batch if id not in found]
+    for register in REGISTERS[1:]:
+        missing = list(found)
+        for _ in range(TRIES):
+            for batch in (missing[i : i + BATCH] for i in range(0, len(missing), BATCH)):
+                _read(wire, clock, batch, register, found, swept)
+            missing = [id for id in found if register not in found[id].registers]
+    _states(wire, clock, found, swept)
+    swept.motors = [found[id] for id in sorted(found)]
+    return swept
+
+
+def _read(wire: CanWire, clock: Clock, ids: list[int], register: str, found: dict[int, Found], swept: Sweep) -> None:
+    """Ask ``ids`` for a register and enter what they say."""
+    answered: set[int] = set()
+    for identifier, data in _converse(
+        wire, clock, [damiao.pack_register(id, Operation.READ, register) for id in ids], swept
+    ):
+        answer = damiao.unpack_register(data)
+        if answer.operation != Operation.READ or answer.register != register or answer.id not in ids:
+            continue
+        motor = found.setdefault(answer.id, Found(answer.id))
+        motor.duplicate |= answer.id in answered or motor.registers.get(register, answer.value) != answer.value
+        motor.feedback_ids.add(identifier)
+        motor.registers[register] = answer.value
+        answered.add(answer.id)
+    for motor in found.values():
+        motor.duplicate |= len(motor.feedback_ids) > 1
+
+
+def _states(wire: CanWire, clock: Clock, found: dict[int, Found], swept: Sweep) -> None:
+    """Ask each motor for its state, for its error and because two of them will not stand alike."""
+    for motor in found.values():
+        question = [damiao.pack_register(motor.id, Operation.REFRESH)]
+        told = [data for id, data in _converse(wire, clock, question, swept) if id in motor.feedback_ids]
+        motor.duplicate |= len(told) > 1
+        for data in told:
+            status = int(data[0]) >> 4
+            motor.error = damiao.ERRORS.get(status, f"unknown status {status:#x}") if status > 1 else motor.error
+
+
+def _converse(
+    wire: CanWire, clock: Clock, questions: list[np.ndarray], swept: Sweep
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Send ``questions`` to everybody; the (identifier, payload) of what comes back within ANSWER_TIME."""
+    if not questions:
+        return
+    wire.send(make_frames(np.full(len(questions), damiao.BROADCAST_ID, np.uint32), np.array(questions)))
+    start = clock.now()
+    for n in range(round(ANSWER_TIME / POLL_PERIOD)):
+        clock.sleep_until(start + (n + 1) * POLL_PERIOD)
+        for frame in wire.recv():
+            if frame["id"] & ERROR:
+                swept.error_frames += 1
+            elif frame["length"] == 8:
+                yield int(frame["id"]), frame["data"]
+
+
+SWEEPS: dict[str, Callable[..., Sweep]] = {"damiao": sweep_damiao}  # by protocol
+
+
+def verdicts(swept: Sweep, spec: BusSpec | None = None) -> list[dict[str, Any]]:
+    """A plain object for each motor found, and for each that the wiring ``spec`` has and nobody answered for.
+
+    ``problems``: what is wrong with it and what to do; empty: nothing.
+    """
+    wired = {m.id: m for m in spec.motors} if spec else {}
+    out = []
+    for motor in swept.motors:
+        r, m = motor.registers, wired.get(motor.id)
+        problems = []
+        if motor.duplicate:
+            problems.append("two motors have this id: unplug one, and give the other a new ESC_ID")
+        if motor.error:
+            problems.append(f"error: {motor.error}")
+        if r.get("CTRL_MODE", damiao.MIT_MODE) != damiao.MIT_MODE:
+            problems.append(f"CTRL_MODE {r['CTRL_MODE']:g}, expected {damiao.MIT_MODE} (MIT): write it")
+        if motor.feedback_ids == {0}:
+            problems.append(f"MST_ID 0, expected one of its own, as {motor.id + 0x10:#x}: write it")
+        if spec and m is None:
+            problems.append("not in the wiring: add it, or unplug it")
+        if m is not None and m.feedback_id not in motor.feedback_ids:
+            got = ", ".join(f"{i:#x}" for i in sorted(motor.feedback_ids))
+            problems.append(f"answers on {got}, the wiring says {m.feedback_id:#x}: correct one of them")
+        if silent := [name for name in REGISTERS if name not in r]:
+            problems.append(f"fell silent: no answer about {', '.join(silent)}; check its connector and its power")
+        elif m is not None and m.model not in motor.models:
+            problems.append(f"ranges of {' or '.join(motor.models) or 'no known model'}, the wiring says {m.model}")
+        out.append(
+            {
+                "id": motor.id,
+                "joint": m.joint if m else "",
+                "feedback_ids": sorted(motor.feedback_ids),
+                "models": motor.models,
+                "registers": r,
+                "problems": problems,
+            }
+        )
+    heard = {motor.id for motor in swept.motors}
+    for id, m in wired.items():
+        if id not in heard:
+            what = "no answer: check power, connector and bit rate; if a stranger is above, its ESC_ID may be the wrong one"
+            out.append(
+                {"id": id, "joint": m.joint, "feedback_ids": [], "models": [], "registers": {}, "problems": [what]}
+            )
+    return sorted(out, key=lambda row: row["id"])
