@@ -58,6 +58,7 @@ def describe(words: tuple[str, ...], data: Path | None, report: Path | None) -> 
     """Print what the clips hold. Raises ClipError."""
     clips = _chosen(words, data)
     table = Table("clip", "skill", "body", "s", "fps", "joints", "contact", "gravity", "bounce")
+    table.columns[0].no_wrap = True
     for clip in clips:
         c = check.check(clip)
         table.add_row(
@@ -155,6 +156,7 @@ def _chosen(words: tuple[str, ...], data: Path | None) -> list[Clip]:
 
 def _print_residuals(rows: dict[str, Residuals]) -> None:
     table = Table("clip", *COLUMNS)
+    table.columns[0].no_wrap = True
     for name, row in rows.items():
         table.add_row(escape(name), *_cells(row))
     _console().print(table)
@@ -162,9 +164,9 @@ def _print_residuals(rows: dict[str, Residuals]) -> None:
 
 
 def _console() -> Console:
-    """As wide as the terminal; 130 columns into a file."""
+    """As wide as the terminal; 150 columns into a file."""
     console = Console()
-    return console if console.is_terminal else Console(width=130)
+    return console if console.is_terminal else Console(width=150)
 
 
 def _cells(row: Residuals) -> list[str]:
