@@ -35,7 +35,7 @@ INPUTS: dict[str, Signal] = {
     "command_velocity": Signal(3, "m/s, m/s, rad/s", "command/body/velocity", "forward, left, turn, in the base"),
     "skill": Signal("skills", "1", "command/skill", "one-hot over skill_labels"),
     "object_position_in_base": Signal(3, "m", "state/body/position", "centre of the object"),
-    "object_velocity_in_base": Signal(3, "m/s", "state/body/linear_velocity", "of the object's centre"),
+    "object_velocity_in_base": Signal(3, "m/s", "state/body/linear_velocity", "of the object, less the base's own"),
     "linear_velocity_base_in_base": Signal(3, "m/s", "state/body/linear_velocity", "needs an estimator on hardware"),
 }
 OUTPUTS: dict[str, Signal] = {

@@ -15,6 +15,7 @@ import numpy as np
 
 from sim2real.config import RobotConfig
 from sim2real.contract import CARRY, INPUTS, Contract
+from sim2real.tracker import ObjectEstimate, ObjectTracker
 from sim2real.types import JointCommand, Mode, OperatorInput, RobotState, Sim2realError
 
 
@@ -48,6 +49,8 @@ class Refusal(NamedTuple):
 class SkillPlayer:
     """Runs the skills of one or more policies on one robot.
 
+    ``tracker``: who tells where the object is; whoever runs the player feeds it sightings.
+
     Labels of all policies share one namespace (``labels``). A wish for another label is granted if the contract allows
     the transition, the current skill has had its dwell time, and the policy expects to manage it (``value_min``);
     otherwise ``refusals`` says why and the current skill goes on. Between two policies the targets blend.
@@ -58,7 +61,7 @@ class SkillPlayer:
     blend_time = 0.3  # s from one policy's targets to another's
     operator_timeout = 0.5  # s: an operator older than this wants velocity zero
 
-    def __init__(self, config: RobotConfig, policies: Sequence[Runnable], extra: Mapping[str, object] | None = None):
+    def __init__(self, config: RobotConfig, policies: Sequence[Runnable], tracker: ObjectTracker | None = None):
         if not policies:
             raise Sim2realError(f"{config.name}: no policy to run; give one with --policy FILE.onnx")
         self.config = config
@@ -75,7 +78,8 @@ class SkillPlayer:
         if len(periods) > 1:
             raise Sim2realError(f"policies: got periods {sorted(periods)} s, expected one; export them at one rate")
         self.period = periods.pop()
-        self.plans = [_Plan(config, policy.contract) for policy in policies]
+        self.tracker = tracker
+        self.plans = [_Plan(config, policy.contract, tracker) for policy in policies]
         n = len(config.joint_names)
         self.command = JointCommand(-np.inf, *(np.zeros(n) for _ in range(5)))
         self.values = np.full(len(self.labels), np.nan)
@@ -113,7 +117,9 @@ class SkillPlayer:
 
     def step(self, state: RobotState, mode: Mode, operator: OperatorInput, now: float) -> JointCommand:
         """One policy tick. Returns the same JointCommand object each time; never raises on a bad state: that is the
-        gate's to judge, so a non-finite state yields the previous targets again."""
+        gate's to judge, so a non-finite state yields the previous targets again. So does an object nobody has seen yet."""
+        if self.tracker is not None:
+            self.tracker.estimate(now, state.orientation_base_in_world)
         if mode != Mode.RUN and mode != Mode.HOLD:
             self.stage = Stage.STANDBY
         elif self.stage == Stage.STANDBY:
@@ -209,7 +215,8 @@ class SkillPlayer:
 class _Plan:
     """How one policy's tensors map onto the robot's joints; buffers for its inputs."""
 
-    def __init__(self, config: RobotConfig, contract: Contract):
+    def __init__(self, config: RobotConfig, contract: Contract, tracker: ObjectTracker | None = None):
+        self.object = tracker.current if tracker is not None else ObjectEstimate()
         self.observed = config.indices(contract.joint_names)
         self.targets = config.indices(contract.target_joint_names)
         self.posture = config.home_pos.copy()
@@ -228,6 +235,11 @@ class _Plan:
         if strangers := [n for n in signals if n not in _SOURCES]:
             raise Sim2realError(
                 f"{contract.name}: nothing on this robot measures {', '.join(strangers)}; it measures {', '.join(_SOURCES)}"
+            )
+        if tracker is None and (objects := [n for n in signals if n in OBJECT]):
+            raise Sim2realError(
+                f"{contract.name}: needs {' and '.join(objects)}, and nothing tracks an object in this run;"
+                " give it a tracker, with a camera or motion capture that sends sightings (sim2real/object/packet.py)"
             )
         self._sources = [(_SOURCES[name], self.inputs[name][0]) for name in signals]
 
@@ -264,6 +276,14 @@ def _skill(plan, state, velocity, skill, out):
     out[skill] = 1.0
 
 
+def _object_position(plan, state, velocity, skill, out):
+    out[:] = plan.object.position_in_base
+
+
+def _object_velocity(plan, state, velocity, skill, out):
+    out[:] = plan.object.velocity_in_base
+
+
 _SOURCES = {
     "joint_pos": _joint_pos,
     "joint_vel": _joint_vel,
@@ -271,6 +291,9 @@ _SOURCES = {
     "angular_velocity_base_in_base": _angular_velocity,
     "command_velocity": _command_velocity,
     "skill": _skill,
+    "object_position_in_base": _object_position,
+    "object_velocity_in_base": _object_velocity,
 }
 assert set(_SOURCES) <= set(INPUTS)
+OBJECT = ("object_position_in_base", "object_velocity_in_base")  # these need a tracker
 MEASURED = tuple(_SOURCES)  # the signals that a robot can feed a policy

@@ -41,8 +41,8 @@ CASES = {
         f"joint_names: got 'left_knee', expected a joint of g1 (did you mean '{KNEE}'?)",
     ),
     "signal": (
-        {"inputs": {"joint_pos": [len(G1.joints)], "object_position_in_base": [3], "carry_x": [1]}},
-        "inputs.object_position_in_base: got a signal nothing measures, expected one of joint_pos, joint_vel,",
+        {"inputs": {"joint_pos": [len(G1.joints)], "linear_velocity_base_in_base": [3], "carry_x": [1]}},
+        "inputs.linear_velocity_base_in_base: got a signal nothing measures, expected one of joint_pos, joint_vel,",
     ),
     "kp": (
         {"kp": replaced(G1.home_kp, N, np.nextafter(LIMIT.kp_max, np.inf))},
