@@ -116,6 +116,8 @@ class SerialWorld(World):
 class AllServos:
     """The servos of all buses, each bus on its share of the joints of ``body``."""
 
+    speaks = False  # without being asked
+
     def __init__(
         self,
         buses: Sequence[BusSpec],
