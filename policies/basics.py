@@ -61,6 +61,10 @@ class Basics:
     balance_offset: float = 0.19  # rad
     balance_gain: float = 2.3  # rad of ankle per rad of pitch
     balance_damping: float = 0.25  # rad per rad/s
+    # And arms that swing against a fall, by swing_gain x what the capture point (an angle) exceeds swing_from by.
+    pendulum: float = 3.6  # 1/s, sqrt(g / height of the centre of mass)
+    swing_from: float = 0.08  # rad
+    swing_gain: float = 6.0  # rad per rad
     reference_rate: float = 2.5  # rad/s, the fastest a reference moves
     reference_pull: float = 8.0  # 1/s, how eagerly it moves towards its goal
     position_margin: float = 0.05  # rad inside the mechanical range; wider than the safety gate's
@@ -70,6 +74,7 @@ class Basics:
     switch: tuple[float, float] = (1.5, 5.0)  # s between skill switches
     push: tuple[float, float] = (1.5, 4.0)  # s between pushes
     push_speed: tuple[float, float] = (0.2, 0.9)  # m/s, the largest at curriculum level 0 and 1
+    push_least: float = 0.0  # share of the largest push that each has at least
     push_turn: float = 0.6  # rad/s per m/s of push
     home_start: float = 0.2  # share of episodes that start at home instead of inside a motion
     # the learner

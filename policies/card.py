@@ -28,6 +28,7 @@ from sim2real.policy import load_policy
 
 SECONDS = 10.0  # of an episode
 PUSH = 0.5  # m/s
+SINGLE = (0.2, 0.3, 0.4, 0.5)  # m/s
 EVERY = 2.5  # s between the skill changes of the deployed runs
 Tell = Callable[[str], None]
 
@@ -40,6 +41,7 @@ class Evaluation:
     calm: dict[str, Rate]  # by label
     pushed: dict[str, Rate]
     error: dict[str, float]  # rad, mean distance of the joints from their reference, undisturbed
+    single: dict[str, Rate]  # one push of exactly so many m/s at 3 s of 6 s, any skill
     switches: dict[str, Rate]  # "first > second"
     trained: Rate  # random skills, in the training environment
     deployed: Rate  # the same, through the bytes
@@ -82,6 +84,11 @@ def evaluate(path: Path, config: Basics, episodes: int, deployed: int, tell: Tel
     calm = run_episodes(config, actor, skills, seed=1)
     tell(f"every skill, pushed up to {PUSH:g} m/s")
     pushed = run_episodes(config, actor, skills, PUSH, seed=2)
+    single = {}
+    for speed in SINGLE:
+        tell(f"one push of {speed:g} m/s")
+        once = dataclasses.replace(config, push=(3.0, 3.0), push_least=1.0)
+        single[f"{speed:g}"] = run_episodes(once, actor, mixed[:, : round(5.9 / config.period)], speed, seed=6).rate()
     tell(f"all {len(pairs)} switches")
     switched = run_episodes(config, actor, switches, seed=3)
     tell("random skills")
@@ -101,6 +108,7 @@ def evaluate(path: Path, config: Basics, episodes: int, deployed: int, tell: Tel
         calm=by(labels, calm, episodes),
         pushed=by(labels, pushed, episodes),
         error={label: float(calm.error[k * episodes : (k + 1) * episodes].mean()) for k, label in enumerate(labels)},
+        single=single,
         switches=by([f"{labels[a]} > {labels[b]}" for a, b in pairs], switched, len(switches) // len(pairs)),
         trained=trained.rate(),
         deployed=survived[0.0],
@@ -150,6 +158,8 @@ Share of {SECONDS:g} s episodes without a fall, with 95 % confidence, on robots 
 |---|---|---|---|---|
 {skills}
 
+- One push of exactly 0.2, 0.3, 0.4, 0.5 m/s in a random direction: {", ".join(f"{r.value:.0%}" for r in e.single.values())}
+  survive the next 3 s ({e.single["0.5"].episodes} episodes each).
 - Every ordered switch: {total}; the worst, `{worst[0]}`, {worst[1].survived} of {worst[1].episodes}.
 - Random skills every {EVERY:g} s: {e.trained} in the training environment, {e.deployed} through the bytes (real codecs,
   emulated motors, safety gate; a fault counts as a fall): {e.gap:+.1f} points lost. Pushed, through the bytes: {e.deployed_pushed}.
@@ -164,7 +174,8 @@ Share of {SECONDS:g} s episodes without a fall, with 95 % confidence, on robots 
 
 ## Limits
 
-- Flat ground only, and nothing in the hands. It steps to recover if it must, but it cannot walk.
+- Flat ground only, and nothing in the hands. It cannot walk, and it has not learned to step: it recovers by ankles and
+  hips, so a push is survived while the feet can hold it (about 0.3 m/s forwards or backwards, 0.5 m/s sideways).
 - It has only ever seen the simulated body of `configs/robots/{contract.robot}.xml`; nobody has run it on hardware.
 - The skills are formulas, not human motion: they show that the path from training to motors is sound.
 """
@@ -191,6 +202,7 @@ def eval_command(file: Path, episodes: int, deployed: int, report: Path | None, 
         rates = [e.switches.get(f"{first} > {second}") for second in contract.skill_labels]
         table.add_row(first, *(f"{r.survived}/{r.episodes}" if r else "-" for r in rates))
     console.print(table)
+    console.print("one push: " + ", ".join(f"{speed} m/s {rate.value:.0%}" for speed, rate in e.single.items()))
     console.print(
         f"random skills: {e.trained} in training, {e.deployed} through the bytes, {e.gap:+.1f} points lost\n"
         f"pushed, through the bytes: {e.deployed_pushed}; faults: {', '.join(e.faults) or 'none'}"

@@ -187,7 +187,7 @@ class Env(VecEnv):
         self._push_in -= 1
         now = np.flatnonzero(self._push_in <= 0)
         low, high = config.push_speed
-        speed = rng.uniform(0, low + (high - low) * self.level, len(now))
+        speed = rng.uniform(config.push_least, 1.0, len(now)) * (low + (high - low) * self.level)
         heading = rng.uniform(-np.pi, np.pi, len(now))
         self._qvel[now, 0] += speed * np.cos(heading)
         self._qvel[now, 1] += speed * np.sin(heading)

@@ -17,14 +17,17 @@ from sim2real.config import RobotConfig, load_robot
 class PolicyGraph(nn.Module):
     """Residual actions on a reference pose.
 
-    ``target = clip(reference + balance + scale * clip(action))``, with the reference from the skill's formula, a simple
-    ankle strategy for balance, and the action from the actor. ``actor`` and ``critic`` map a raw observation (N, size) to actions (N, n) and a value (N, 1); without them
+    ``target = clip(reference + balance + scale * clip(action))``, with the reference from the skill's formula, simple
+    reflexes for balance, and the action (legs and waist) from the actor. ``actor`` and ``critic`` map an observation
+    (N, size) to actions (N, driven) and a value (N, 1); without them
     the graph still observes and makes targets, which is all that the training environment needs of it.
     """
 
     scale: Tensor
     drive: Tensor
     ankles: Tensor
+    shoulders: Tensor
+    legs: Tensor
     lower: Tensor
     upper: Tensor
     value_healthy: Tensor
@@ -52,8 +55,11 @@ class PolicyGraph(nn.Module):
         self.register_buffer("drive", torch.diag(self.scale)[self.driven])  # actions to joints
         self.register_buffer("lower", _buffer(robot.position_min + margin))
         self.register_buffer("upper", _buffer(robot.position_max - margin))
-        ankles = ["ankle_pitch" in name for name in robot.joint_names]
-        self.register_buffer("ankles", torch.tensor(ankles, dtype=torch.float32))
+        part = lambda joint: torch.tensor([float(joint in name) for name in robot.joint_names])  # noqa: E731
+        self.register_buffer("ankles", part("ankle_pitch"))
+        self.register_buffer("shoulders", part("shoulder_pitch"))
+        # Thigh and shin are equally long: their mean pitch is that of the line from ankle to hip, here of both legs.
+        self.register_buffer("legs", part("hip_pitch") / 2 + part("knee") / 4)
         self.register_buffer("value_healthy", torch.ones(len(self.labels)))
         self.actor: nn.Module = nn.Identity()
         self.critic: nn.Module = nn.Identity()
@@ -64,12 +70,21 @@ class PolicyGraph(nn.Module):
 
     def target(self, signals: Signals, action: Tensor) -> Tensor:
         """Joint targets (N, n) rad for a clipped ``action`` (N, driven)."""
+        target = signals.reference + self.balance(signals) + action @ self.drive
+        return torch.minimum(torch.maximum(target, self.lower), self.upper)
+
+    def balance(self, signals: Signals) -> Tensor:
+        """What a person does without thinking (N, n) rad: ankles lean against the pitch; arms swing once the capture
+        point, lean + rate / pendulum frequency, comes near the end of the feet (Pratt et al., "Capture Point", 2006)."""
         config = self.config
-        pitch = gravity_in_base(signals.orientation_base_in_world)[:, 0:1]  # sine of the forward lean
+        pitch = gravity_in_base(signals.orientation_base_in_world)[:, 0:1]  # sine of the forward pitch
         pitch_rate = signals.angular_velocity_base_in_base[:, 1:2]
         ankle = config.balance_offset + config.balance_gain * pitch + config.balance_damping * pitch_rate
-        target = signals.reference + self.ankles * ankle + action @ self.drive
-        return torch.minimum(torch.maximum(target, self.lower), self.upper)
+        lean = pitch + ((signals.joint_pos - signals.reference) * self.legs).sum(-1, keepdim=True)
+        lean_rate = pitch_rate + (signals.joint_vel * self.legs).sum(-1, keepdim=True)
+        capture = lean + lean_rate / config.pendulum
+        swing = capture - torch.clamp(capture, -config.swing_from, config.swing_from)
+        return ankle * self.ankles + config.swing_gain * swing * self.shoulders
 
     def clip(self, action: Tensor) -> Tensor:
         return torch.clamp(action, -self.config.action_max, self.config.action_max)

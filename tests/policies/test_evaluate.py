@@ -146,11 +146,13 @@ def test_the_card_says_what_was_measured(file):
     rates = {label: Rate(7 + k, 20) for k, label in enumerate(labels)}
     pairs, script = switch_script(CONFIG, LABELS, 2)
     switched = Episodes(np.arange(len(script)) > 1, np.zeros(len(script)))
-    e = Evaluation("ab" * 32, rates, rates, {label: 0.04 for label in labels},
+    single = {"0.2": Rate(20, 20), "0.3": Rate(13, 20), "0.4": Rate(9, 20), "0.5": Rate(3, 20)}
+    e = Evaluation("ab" * 32, rates, rates, {label: 0.04 for label in labels}, single,
                    by([f"{labels[a]} > {labels[b]}" for a, b in pairs], switched, 2),
                    Rate(18, 20), Rate(16, 20), Rate(9, 20), 0.07, "left_knee_joint", 0.61, ["S2R-009"])  # fmt: skip
     text = card(policy.contract, e)
     assert all(str(rate) in text for rate in rates.values())
+    assert "100%, 65%, 45%, 15%" in text
     assert "+10.0 points" in text and "S2R-009" in text and f"`{labels[0]} > {labels[1]}`, 0 of 2" in text
     document = json.loads(json.dumps(e.as_dict()))
     assert document["deployed"]["value"] == 0.8 and document["gap"] == pytest.approx(10.0)
