@@ -30,9 +30,9 @@ class Camera:
         self,
         path: Path,
         visuals: Path | None = None,
-        rate: float = 20.0,
-        width: int = 480,
-        height: int = 360,
+        rate: float = 12.5,
+        width: int = 400,
+        height: int = 300,
         distance: float = 2.6,
     ):
         self.path, self.rate, self._size, self._visuals = Path(path), rate, (height, width), visuals
