@@ -37,6 +37,7 @@ PROTOCOLS: dict[str, BusProtocol] = {
     "robstride_mit": _can("robstride_mit", "RobstrideMit", watchdog=False),
     "odrive": _can("odrive", "Odrive", watchdog=False),
     "dynamixel": BusProtocol("serial", "drivers.serial_bus:SerialBus", "drivers.codecs.dynamixel:DynamixelCodec"),
+    "feetech": BusProtocol("serial", "drivers.serial_bus:SerialBus", "drivers.codecs.feetech:FeetechCodec"),
     "unitree_hg": BusProtocol("dds", "drivers.dds_bus:DdsBus", "drivers.codecs.unitree_hg:UnitreeHgCodec"),
 }
 
