@@ -84,7 +84,10 @@ class PolicyGraph(nn.Module):
         lean_rate = pitch_rate + (signals.joint_vel * self.legs).sum(-1, keepdim=True)
         capture = lean + lean_rate / config.pendulum
         swing = capture - torch.clamp(capture, -config.swing_from, config.swing_from)
-        return ankle * self.ankles + config.swing_gain * swing * self.shoulders
+        hanging = (
+            torch.clamp(torch.cos(signals.reference), min=0.0) ** 2
+        )  # raised arms would topple what they should save
+        return ankle * self.ankles + config.swing_gain * swing * hanging * self.shoulders
 
     def clip(self, action: Tensor) -> Tensor:
         return torch.clamp(action, -self.config.action_max, self.config.action_max)
