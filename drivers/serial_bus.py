@@ -209,12 +209,16 @@ class SerialBus:
         self, request: Callable[[], bytes], take: Callable[[bytes], bool], clock: Clock, tries: int = TRIES
     ) -> bool:
         """Send what ``request`` makes and give ``take`` what arrives until it is content, up to ``tries`` times."""
-        for _ in range(tries):
+        for attempt in range(tries):
             self._transmit(request(), required=True)
             end = clock.now() + ANSWER_TIME
             while clock.now() < end:
                 clock.sleep_until(clock.now() + POLL_PERIOD)
                 if take(self._receive()):
+                    if attempt:  # late answers to the tries before must not pass for answers to the next question
+                        clock.sleep_until(clock.now() + ANSWER_TIME)
+                        self._receive()
+                        self._codec.finish(self._state, clock.now())
                     return True
             self._codec.finish(self._state, clock.now())
         return False

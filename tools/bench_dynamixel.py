@@ -1,0 +1,105 @@
+"""Benchmark: a cycle of 20 Dynamixel servos on a pseudo-terminal, and what a lost answer costs, against dynamixel-sdk.
+
+Servos are emulated in a process of their own, with the time that bytes take on a line of 4 Mbit/s, and without.
+"""
+
+from __future__ import annotations
+
+import select
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from time import perf_counter, process_time, sleep
+
+import numpy as np
+from bench_table import ROOT, Row
+
+from drivers.bus import MotorCommand
+from drivers.codecs.dynamixel import DynamixelCodec
+from drivers.serial_bus import SerialBus
+from drivers.serial_wire import PySerialWire
+from drivers.sim.serial_pty import bus_of
+from sim2real.clock import MonotonicClock
+
+SERVOS, BAUD = 20, 4_000_000
+FACTOR, LOSS = 8.0, 2e-3  # less CPU than the SDK; s of a cycle that a lost answer may cost
+FAULT_AT = 2.0  # s after its servos started
+Cycle = Callable[[], object]
+
+
+def rows() -> Iterator[Row]:
+    """CPU of a cycle on a line that takes its time and on one that does not; what one lost answer adds to a cycle."""
+    for option, words in (([], "4 Mbit/s"), (["--instant"], "no time on the line")):
+        with port("--no-fast", *option) as path:
+            ours, theirs = measured([host(path), sdk(path)], process_time, 20)
+        what, ratio = f"dynamixel: goals and states of {SERVOS} servos, {words}, CPU a cycle", theirs / ours
+        yield Row(what, f"{ours * 1e6:.0f} us", f"{theirs * 1e6:.0f} us dynamixel-sdk", f"{ratio:.1f}x less",
+                  f">= {FACTOR:g}x", ratio >= FACTOR, {"seconds": {"ours": ours, "sdk": theirs}})  # fmt: skip
+    with port("--no-fast") as whole, port("--no-fast", "--fault", f"drop:servos/servo_10@{FAULT_AT}") as lossy:
+        cycles = [host(whole), sdk(whole), host(lossy), sdk(lossy)]
+        sleep(FAULT_AT)
+        ours, theirs, ours_lost, theirs_lost = measured(cycles, perf_counter, 5)
+        heard = cycles[2]()
+    cost, sdk_cost = ours_lost - ours, theirs_lost - theirs
+    what = f"dynamixel: a lost answer, {heard} of {SERVOS} servos heard, cycle longer by"
+    yield Row(what, f"{cost * 1e3:.2f} ms", f"{sdk_cost * 1e3:.0f} ms dynamixel-sdk, which drops those behind it", "",
+              f"< {LOSS * 1e3:g} ms", cost < LOSS and heard == SERVOS - 1,
+              {"seconds": {"ours": cost, "sdk": sdk_cost}})  # fmt: skip
+
+
+@contextmanager
+def port(*options: str) -> Iterator[str]:
+    """The path of a pseudo-terminal with servos behind it."""
+    program = ["-m", "drivers.sim.serial_pty", "--count", str(SERVOS), "--baud", str(BAUD), *options]
+    with subprocess.Popen([sys.executable, *program], cwd=ROOT, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            yield server.stdout.readline().strip()
+        finally:
+            server.terminate()
+
+
+def measured(cycles: list[Cycle], clock: Callable[[], float], blocks: int) -> list[float]:
+    """Median seconds of each cycle, in interleaved blocks of ten: others on this machine slow all down alike."""
+    times = np.zeros((len(cycles), blocks, 10))
+    for block, k, i in np.ndindex(blocks, len(cycles), 10):
+        start = clock()
+        cycles[k]()
+        times[k, block, i] = clock() - start
+    return np.median(times, axis=(1, 2)).tolist()
+
+
+def host(path: str) -> Cycle:
+    """Our cycle: goals out, then states in until all have answered or their time is over. Returns how many answered."""
+    clock, spec, wire = MonotonicClock(), bus_of("XM430-W350", SERVOS, BAUD), PySerialWire(path, BAUD)
+    servos = SerialBus(spec, DynamixelCodec(spec), wire)
+    servos.connect(clock)
+    command = MotorCommand(*np.zeros((5, SERVOS)))
+
+    def cycle() -> int:
+        began = clock.now()
+        servos.write(command)
+        while (left := servos.waiting) > 0.0:
+            select.select([wire], [], [], left)
+            servos.read(clock.now())
+        return int(np.count_nonzero(servos.read(clock.now()).time > began))
+
+    return cycle
+
+
+def sdk(path: str) -> Cycle:
+    """The maker's: goal positions out, then current, velocity and position of each servo in, as numbers."""
+    import dynamixel_sdk as api
+
+    serial, packets, ids = api.PortHandler(path), api.PacketHandler(2.0), range(1, SERVOS + 1)
+    serial.openPort(), serial.setBaudRate(BAUD)
+    goals, present = api.GroupSyncWrite(serial, packets, 116, 4), api.GroupSyncRead(serial, packets, 126, 10)
+    for id in ids:
+        goals.addParam(id, [0, 8, 0, 0]), present.addParam(id)
+
+    def cycle() -> None:
+        goals.txPacket(), present.txRxPacket()
+        [present.getData(id, *item) for id in ids for item in ((126, 2), (128, 4), (132, 4))]
+
+    return cycle
