@@ -68,7 +68,9 @@ def test_no_torn_read_while_another_process_writes_as_fast_as_it_can(tmp_path):
     path = tmp_path / "c.channel"
     reader = Channel(LAYOUT, path)
     root = str(__file__).rsplit("/tests/", 1)[0]
-    writer = subprocess.Popen([sys.executable, "-c", code, root, str(path)], stdout=subprocess.PIPE, text=True, cwd=root)
+    writer = subprocess.Popen(
+        [sys.executable, "-c", code, root, str(path)], stdout=subprocess.PIPE, text=True, cwd=root
+    )
     reads, last = 0, 0.0
     while writer.poll() is None:
         if reader.read():
