@@ -68,7 +68,8 @@ class SkillMimic:
 
 
 TASKS: dict[str, SkillMimic] = {
-    "g1-hold": SkillMimic(),
+    # 4 s, not 1.2: whoever holds a ball for long drifts, and has to have been there
+    "g1-hold": SkillMimic(frames=200),
     "g1-ball": SkillMimic(clips=(), skills=("hold", "raise", "carry", "pass", "catch", "pickup"), balance_gain=0.0,
                           balance_damping=0.0, samples=100e6),
 }  # fmt: skip

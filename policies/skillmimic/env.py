@@ -18,6 +18,7 @@ from policies.clips.kinematics import conjugate, multiply, quaternion_from_rotat
 from policies.clips.robot import POINT_NAMES, RobotBody
 from policies.env import POSITION_STEP, VELOCITY_STEP
 from policies.graph import one_hot
+from policies.skillmimic.amp import Discriminator, features
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.observations import observe
@@ -70,6 +71,12 @@ class Env(VecEnv):
         self.observation, self.privileged = torch.zeros(0), torch.zeros(0)
         self.terms: dict[str, np.ndarray] = {}  # sub-rewards of the last step
         self.failures = np.zeros(n, bool)
+        self.discriminator: Discriminator | None = None
+        if config.variant == "amp":
+            self.discriminator = Discriminator(self.clips, self.substeps, seed)
+            self._last_features = np.zeros(
+                (n, features(self.clips.motion(*self.clips.rows(self.clip, self.row))).shape[1])
+            )
         self.reset()
 
     # rsl_rl's side
@@ -85,6 +92,10 @@ class Env(VecEnv):
         self._act(actions.detach())
         self.now = now = self._judge((self.action - last_action).numpy())
         rewards, self.terms = reward(now, self.config.variant, self.sensitivity)
+        if self.discriminator is not None:
+            seen = features(now.state)
+            rewards = self.discriminator.reward(np.concatenate([self._last_features, seen], axis=1))
+            self.terms, self._last_features = {"discriminator": rewards}, seen
         self.failures = failed(now, self.config.terminations)
         rewards[~np.isfinite(rewards)] = 0.0
         self.episode_length_buf += 1
@@ -107,10 +118,13 @@ class Env(VecEnv):
 
     def state_dict(self) -> dict:
         """What a resumed run needs; call ``reset`` on both sides of a checkpoint and they continue alike."""
-        return {"rng": self.rng.bit_generator.state}
+        more = {} if self.discriminator is None else {"discriminator": self.discriminator.state_dict()}
+        return {"rng": self.rng.bit_generator.state, **more}
 
     def load_state_dict(self, state: dict) -> None:
         self.rng.bit_generator.state = state["rng"]
+        if self.discriminator is not None:
+            self.discriminator.load_state_dict(state["discriminator"])
         self.reset()
 
     # one policy period
@@ -256,7 +270,10 @@ class Env(VecEnv):
         self.target[ids] = _tensor(self.clips.target[rows])
         self.action[ids], self.history[ids] = 0.0, 0.0
         self._lost[ids] = 0
-        self._last_points[ids] = self.clips.motion(rows, np.ones(k)).points
+        before = self.clips.motion(*self.clips.rows(self.clip[ids], np.maximum(self.row[ids] - 1, 0)))
+        self._last_points[ids] = before.points
+        if self.discriminator is not None:
+            self._last_features[ids] = features(before)
         self._last_joint_vel[ids] = qvel[:, RATES]
         self.episode_length_buf[ids] = 0
 

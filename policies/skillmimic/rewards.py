@@ -171,7 +171,7 @@ VARIANTS: dict[str, Variant] = {
     "no_cgr": Variant({n: t for n, t in _FULL.items() if n != "contact"}, product, "17"),
     "no_multiplication": Variant(_FULL, mean, "16"),
     "deepmimic": Variant(_DEEPMIMIC, mean, "14"),  # with the sensitivities `deepmimic`
-    # Equation 15: the discriminator's verdict is added by the training run; the environment itself pays nothing.
+    # Equation 15 needs a discriminator (amp.py), which the environment asks instead; nothing is paid here.
     "amp": Variant({"none": lambda s, k: np.zeros(len(s.state.joint_pos))}, product, "15"),
 }
 

@@ -70,6 +70,8 @@ class SkillTraining(Training):
     def step(self) -> dict[str, float]:
         """One iteration; with it the mean of every sub-reward at its last tick."""
         row = super().step()
+        if self.env.discriminator is not None:
+            row |= self.env.discriminator.learn()
         return row | {f"reward_{name}": float(term.mean()) for name, term in self.env.terms.items()}
 
     def evaluate(self) -> dict[str, float]:

@@ -1,0 +1,255 @@
+"""The environment: what starts, what is paid, what ends, and that the actor sees with a robot's senses only."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from policies import ball
+from policies.skillmimic.config import SkillMimic
+from policies.skillmimic.env import BALL, JOINTS, Env
+from policies.skillmimic.evaluate import evaluate, measure
+from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.terminations import TERMINATIONS
+from sim2real.contract import CARRY, INPUTS
+
+CONFIG = SkillMimic(envs=8, threads=1, disturbed=0.0, push_chance=0.0)
+MIXED = dataclasses.replace(CONFIG, skills=("hold", "pass", "pickup"), clips=())
+
+
+@pytest.fixture(scope="module")
+def graph():
+    return PolicyGraph(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def mixed():
+    return PolicyGraph(MIXED)
+
+
+@pytest.fixture
+def env(graph):
+    return Env(CONFIG, 1, graph)
+
+
+def still(env: Env) -> torch.Tensor:
+    return torch.zeros(env.num_envs, env.num_actions)
+
+
+# the table of clips
+
+
+def test_a_swinging_clip_turns_at_both_ends(graph):
+    clips = graph.clips
+    last = clips.length[0] - 1
+    rows, way = clips.rows(np.zeros(5, int), np.array([0, last, last + 1, 2 * last - 1, 2 * last]))
+    assert (rows - clips.first[0]).tolist() == [0, last, last - 1, 1, 0]
+    assert way.tolist() == [1, 1, -1, -1, 1]
+    there, back = (clips.motion(rows[1:2] - 1, np.array([w])) for w in (1.0, -1.0))
+    np.testing.assert_array_equal(there.joint_vel, -back.joint_vel)
+    np.testing.assert_array_equal(there.joint_pos, back.joint_pos)
+
+
+def test_another_clip_stays_at_its_end(mixed):
+    clips = mixed.clips
+    c = int(np.flatnonzero(~clips.swing)[0])
+    rows, way = clips.rows(np.array([c]), np.array([10_000]))
+    assert rows[0] == clips.first[c] + clips.length[c] - 1 and way[0] == 1
+
+
+def test_starts_are_balanced_over_skills_and_then_over_clips(mixed):
+    clip, row = mixed.clips.sample(np.random.default_rng(0), 12_000)
+    assert (row < mixed.clips.length[clip]).all()
+    skills = np.bincount(mixed.clips.skill[clip]) / len(clip)
+    np.testing.assert_allclose(skills, 1 / 3, atol=0.02)
+    clips, all_of = np.bincount(clip) / len(clip), np.bincount(mixed.clips.skill)
+    np.testing.assert_allclose(clips, 1 / 3 / all_of[mixed.clips.skill], atol=0.01)
+
+
+def test_the_reference_graph_is_the_clips_contact(mixed):
+    held = mixed.clips.motion(*mixed.clips.rows(np.array([0]), np.array([20]))).contact[0]
+    passes = int(np.flatnonzero(mixed.clips.skill == 1)[0])
+    thrown = mixed.clips.motion(*mixed.clips.rows(np.array([passes]), np.array([10_000]))).contact[0]
+    assert held.tolist() == [1, 0, 0] and thrown.tolist() == [0, 0, 0]
+
+
+# starting and holding
+
+
+def test_episodes_start_where_their_clip_is(env):
+    for k in range(env.num_envs):
+        rows, _ = env.clips.rows(env.clip[k : k + 1], env.row[k : k + 1])
+        np.testing.assert_allclose(env._qpos[k, BALL], env.clips.qpos[rows[0], BALL])
+        np.testing.assert_allclose(env._qpos[k, JOINTS], env.clips.qpos[rows[0], JOINTS])
+    assert len(np.unique(env.row)) > 4
+
+
+def test_the_posture_alone_holds_the_ball_for_a_second(env):
+    env.episode_length_buf[:] = 0
+    lowest = 1.0
+    for _ in range(50):
+        _, rewards, dones, _ = env.step(still(env))
+        lowest = min(lowest, float(rewards.min()))
+        assert not dones.any()
+    assert lowest > 0.8
+    assert env.now.state.contact.tolist() == env.now.reference.contact.tolist()
+    assert measure(env.now).right.all()
+
+
+def test_disturbed_starts_keep_the_ball_in_the_hands(graph):
+    env = Env(dataclasses.replace(CONFIG, envs=32, disturbed=1.0), 2, graph)
+    arm = np.linalg.norm(env._qpos[:, BALL] - env._qpos[:, :3], axis=1)
+    rows, _ = env.clips.rows(env.clip, env.row)
+    reference = np.linalg.norm(env.clips.qpos[rows, BALL] - env.clips.qpos[rows, :3], axis=1)
+    assert (np.abs(arm - reference) < 0.01).all()
+    assert np.abs(env._qpos[:, JOINTS] - env.clips.qpos[rows, JOINTS]).max() > 0.04
+    env.step(still(env))
+    assert env.now.state.contact[:, 0].mean() > 0.9  # arms off by 0.05 rad a joint may begin with a gap
+
+
+# ending
+
+
+def test_an_episode_ends_after_its_frames(env):
+    env.episode_length_buf[:] = torch.arange(8) + CONFIG.frames - 8
+    _, _, dones, extras = env.step(still(env))
+    assert dones.tolist() == [0] * 7 + [1]
+    assert extras["time_outs"].tolist() == [False] * 7 + [True]
+    assert env.episode_length_buf[7] == 0
+
+
+def test_an_episode_ends_with_its_clip(mixed):
+    env = Env(MIXED, 3, mixed)
+    env.episode_length_buf[:] = 0
+    env.clip[:] = np.flatnonzero(~env.clips.swing)[0]
+    env.row[:] = env.clips.length[env.clip] - env.substeps - 1 - np.arange(8)
+    _, _, dones, _ = env.step(still(env))
+    assert dones.tolist() == [1] + [0] * 7
+
+
+def test_a_lost_ball_ends_the_episode(env):
+    env._qpos[2, BALL] += (1.0, 0.0, 0.0)
+    _, rewards, dones, extras = env.step(still(env))
+    assert env.failures.tolist() == [k == 2 for k in range(8)]
+    assert dones[2] == 1 and not extras["time_outs"][2]
+    assert rewards[2] < 0.1 < rewards[3]
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("fallen", lambda s: s.points.__setitem__((0, 0, 2), 0.25)),
+        ("tilted", lambda s: s.orientation_base_in_world.__setitem__(0, (np.cos(0.6), np.sin(0.6), 0, 0))),
+        ("broken", lambda s: s.joint_vel.__setitem__((0, 3), np.nan)),
+        ("ball_lost", lambda s: s.object_position.__setitem__(0, s.object_position[0] + 0.2)),
+    ],
+)
+def test_terminations(env, name, change):
+    env.step(still(env))
+    state = type(env.now.state)(*(np.array(a) for a in env.now.state))
+    assert not TERMINATIONS[name](env.now).any()
+    change(state)
+    assert TERMINATIONS[name](env.now._replace(state=state)).tolist() == [True] + [False] * 7
+
+
+# seeing
+
+
+def test_the_actor_has_a_robots_senses_only(graph):
+    signals = [name for name in graph.inputs() if not name.startswith(CARRY)]
+    assert set(signals) < set(INPUTS) and "linear_velocity_base_in_base" not in signals
+    assert list(graph.carry_start()) == [name for name in graph.inputs() if name.startswith(CARRY)]
+
+
+def test_where_in_the_world_it_is_and_how_fast_the_actor_cannot_tell(env):
+    before, truth = env.observation.clone(), env.privileged.clone()
+    state = env.rng.bit_generator.state
+    env._observe()  # the same state, with noise of its own
+    env.rng.bit_generator.state = state
+    env._observe()
+    before = env.observation.clone()
+    env.rng.bit_generator.state = state
+    for field, moved in (("qpos", 3.0), ("qvel", 0.7)):
+        for part in (slice(0, 3), BALL if field == "qpos" else slice(-6, -3)):
+            env._recorded[field][..., part] += moved
+    env._qpos[:, :3] += 3.0
+    env._qvel[:, :3] += 0.7
+    env._observe()
+    np.testing.assert_allclose(env.observation, before, atol=1e-5)
+    assert (env.privileged - truth).abs().max() > 0.5
+
+
+def test_a_ball_out_of_sight_is_where_it_was_last_seen(env):
+    env.random.drawn["object_loss"][:] = 0.0
+    env.step(still(env))
+    env._lost[:] = 2
+    before = env.inputs["object_position_in_base"].clone()
+    for seen in (False, False, True):
+        env.step(still(env))
+        same = (env.inputs["object_position_in_base"] == before).all(dim=1)
+        assert not same.any() if seen else same.all()
+
+
+def test_the_exported_graph_is_the_environments(graph, env):
+    graph.actor = torch.nn.Linear(env.observation.shape[1], env.num_actions)
+    torch.manual_seed(0)
+    torch.nn.init.normal_(graph.actor.weight, std=0.02)
+    try:
+        env.reset()
+        env.episode_length_buf[:] = 0
+        carries = {n: torch.zeros(env.num_envs, *graph.inputs()[n]) for n in graph.carry_start()}
+        with torch.no_grad():
+            for _ in range(6):
+                outputs = dict(zip(graph.outputs(), graph(*env.inputs.values(), *carries.values()), strict=True))
+                torch.testing.assert_close(outputs["observation"], env.observation)
+                env.step(graph.actor(env.observation))
+                torch.testing.assert_close(outputs["joint_pos_target"], env.target)
+                carries = {name: outputs[f"{name}_next"] for name in carries}
+    finally:
+        graph.actor = torch.nn.Identity()
+    assert {n: list(v.shape[1:]) for n, v in outputs.items()} == graph.outputs()
+
+
+# randomness
+
+
+def test_the_same_seed_gives_the_same_run(graph):
+    def run() -> torch.Tensor:
+        env = Env(dataclasses.replace(CONFIG, disturbed=0.5, push_chance=0.1), 5, graph)
+        return torch.stack([env.step(still(env))[1] for _ in range(10)])
+
+    assert torch.equal(run(), run())
+
+
+def test_a_resumed_environment_goes_on_alike(graph):
+    env = Env(CONFIG, 7, graph)
+    env.step(still(env))
+    state = env.state_dict()
+    env.reset()
+    other = Env(CONFIG, 8, graph)
+    other.load_state_dict(state)
+    assert torch.equal(env.observation, other.observation)
+    assert torch.equal(env.step(still(env))[1], other.step(still(other))[1])
+
+
+def test_every_ball_is_another_ball(env):
+    fields, drawn, model = env.random._fields, env.random.drawn, env.model
+    g, b = model.geom(ball.NAME).id, model.body(ball.NAME).id
+    np.testing.assert_allclose(fields["body_mass"][:, b], ball.MASS * drawn["ball_mass"][:, 0])
+    np.testing.assert_allclose(fields["geom_size"][:, g, 0], ball.RADIUS * drawn["ball_radius"][:, 0])
+    np.testing.assert_allclose(fields["geom_rbound"][:, g], fields["geom_size"][:, g, 0])
+    for k in range(3):
+        law = ball.contact(CONFIG.timestep, float(drawn["ball_restitution"][k, 0]))
+        np.testing.assert_allclose(fields["geom_solref"][k, g], [-law.stiffness, -law.damping])
+    assert len(np.unique(drawn["ball_friction"])) == env.num_envs
+    np.testing.assert_allclose(fields["geom_size"][0, :g], model.geom_size[:g])  # the robot keeps its shape
+
+
+def test_evaluation_counts_episodes_and_frames(graph):
+    zero = evaluate(graph, episodes=4, seconds=0.4, act=still)
+    assert zero.success.survived == 4 and zero.accuracy > 0.9 and zero.ball_error < 0.03
+    wild = evaluate(graph, episodes=4, seconds=2.0, act=lambda env: still(env) + 6.0)
+    assert wild.success.survived == 0 and wild.accuracy < zero.accuracy

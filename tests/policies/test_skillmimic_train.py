@@ -1,0 +1,95 @@
+"""A few steps of training: that it runs, resumes, and that the discriminator learns what a clip looks like."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from policies.skillmimic.amp import Discriminator, features
+from policies.skillmimic.config import TASKS, SkillMimic
+from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.train import SkillTraining, load_config, load_graph
+from sim2real.types import Sim2realError
+
+TINY = dataclasses.replace(
+    SkillMimic(), envs=8, threads=1, horizon=4, hidden=(16,), samples=64, frames=8,
+    evaluate_every=2, evaluate_envs=4, evaluate_seconds=0.1, save_every=1,
+)  # fmt: skip
+
+
+def test_a_run_writes_its_settings_its_curve_and_its_best_policy(tmp_path):
+    training = SkillTraining(TINY, tmp_path)
+    training.run()
+    rows = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    assert [r["samples"] for r in rows] == [32, 64]
+    assert {"reward", "reward_contact", "reward_body", "success", "ball_error"} <= set(rows[-1])
+    assert load_config(tmp_path) == TINY
+    torch.testing.assert_close(load_graph(tmp_path).actor.state_dict(), training.graph().actor.state_dict())
+
+    again = SkillTraining(dataclasses.replace(TINY, samples=96), tmp_path)
+    assert again.resume() and again.samples == 64
+    torch.testing.assert_close(again.ppo.actor.state_dict(), training.ppo.actor.state_dict())
+    again.run()
+    assert again.samples == 96
+
+
+def test_a_run_of_another_version_is_named(tmp_path):
+    (tmp_path / "config.json").write_text(json.dumps({"config": {"robot": "g1", "magic": 1}}))
+    with pytest.raises(Sim2realError, match=r"config.json: unknown settings magic"):
+        load_config(tmp_path)
+    with pytest.raises(Sim2realError, match="no such checkpoint"):
+        load_graph(tmp_path)
+
+
+def test_the_discriminator_tells_robots_from_clips_and_pays_the_likeness(tmp_path):
+    config = dataclasses.replace(TINY, variant="amp")
+    graph = PolicyGraph(config)
+    judge = Discriminator(graph.clips, 4, seed=1)
+    clips = judge.references(512)
+    robots = clips + np.random.default_rng(0).normal(0, 0.3, clips.shape)
+    judge.reward(robots)
+    first = judge.learn()
+    for _ in range(15):
+        last = judge.learn()
+    assert last["loss_discriminator"] < 0.5 * first["loss_discriminator"]
+    assert last["robots_found"] > 0.95 and last["clips_found"] > 0.95
+    paid = judge.reward(clips)
+    assert paid.mean() > 3 * judge.reward(robots).mean()
+    assert (paid >= 0).all() and (paid <= 1).all()
+
+
+def test_what_the_discriminator_sees_does_not_depend_on_place_or_heading():
+    graph = PolicyGraph(TINY)
+    m = graph.clips.motion(*graph.clips.rows(np.zeros(3, int), np.array([0, 50, 100])))
+    half_turn, ahead = np.array([-1.0, -1.0, 1.0]), np.array([2.0, -1.0, 0.0])
+    q = m.orientation_base_in_world
+    turned = m._replace(
+        points=m.points * half_turn + ahead,
+        orientation_base_in_world=np.column_stack([-q[:, 3], -q[:, 2], q[:, 1], q[:, 0]]),  # z half turn times q
+        object_position=m.object_position * half_turn + ahead,
+        object_velocity=m.object_velocity * half_turn,
+    )
+    np.testing.assert_allclose(features(turned), features(m), atol=1e-9)
+
+
+def test_amp_trains_and_its_discriminator_is_in_the_checkpoint(tmp_path):
+    training = SkillTraining(dataclasses.replace(TINY, variant="amp", samples=32), tmp_path)
+    training.run()
+    row = json.loads((tmp_path / "curve.jsonl").read_text().splitlines()[-1])
+    assert "loss_discriminator" in row and 0 <= row["reward_discriminator"] <= 1
+    again = SkillTraining(dataclasses.replace(TINY, variant="amp"), tmp_path)
+    again.resume()
+    old, new = (t.env.discriminator.network.state_dict() for t in (training, again))
+    torch.testing.assert_close(new, old)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_has_its_clips(task):
+    graph = PolicyGraph(TASKS[task])
+    assert sorted(set(graph.clips.skill)) == list(range(len(TASKS[task].skills)))
+    assert torch.isfinite(graph.postures).all()
+    assert ((graph.postures > graph.lower - 0.3) & (graph.postures < graph.upper + 0.3)).all()
