@@ -65,7 +65,8 @@ class FileActor:
 
     def __init__(self, path: Path, robots: int) -> None:
         self.path = path
-        self.policies: list[Policy] = [load_policy(path, trial=0) for _ in range(robots)]
+        first, data = load_policy(path, trial=0), path.read_bytes()  # proved once, run in every robot
+        self.policies: list[Policy] = [first, *(Policy(data, first.contract, path) for _ in range(robots - 1))]
 
     def __call__(self, env: Env) -> Tensor:
         signals = {name: signal.numpy() for name, signal in env.signals.items()}

@@ -72,7 +72,7 @@ def test_a_row_of_labels_as_steps():
 
 def test_an_episode_that_falls_is_counted_once_and_for_good():
     """Full steam on every joint falls within seconds; doing nothing about balance at home does not within 0.4 s."""
-    script = skill_script(CONFIG, 1, 8, 3.0)
+    script = skill_script(CONFIG, 1, 8, 2.0)
     wild = run_episodes(CONFIG, lambda env: torch.full((8, env.num_actions), 3.0), script)
     assert wild.rate() == Rate(0, 8)
     calm = run_episodes(CONFIG, lambda env: torch.zeros(8, env.num_actions), script[:, :20])
@@ -93,6 +93,7 @@ def file(run):
     return run / "basics.onnx"
 
 
+@pytest.mark.slow
 def test_the_file_does_what_the_checkpoint_does(run, file):
     """On the same robots, tick by tick, through switches, pushes and falls: the torch graph and the exported file."""
     graph = load_graph(run, "last.pt")
@@ -108,18 +109,21 @@ def test_the_file_does_what_the_checkpoint_does(run, file):
     assert fell > 0  # so that starting anew was part of it
 
 
+@pytest.mark.slow
 def test_a_file_made_with_other_settings_is_refused(run, file):
     other = dataclasses.replace(load_graph(run, "last.pt").config, balance_gain=0.0)
     with pytest.raises(Sim2realError, match="other settings"):
         run_episodes(other, FileActor(file, 1), skill_script(other, 1, 1, 0.1))
 
 
+@pytest.mark.slow
 def test_the_file_carries_its_proof(file):
     policy = load_policy(file, trial=0)
     assert policy.golden_error <= 1e-4 and len(policy.contract.golden) >= 3
     assert set(policy.contract.envelope) == {n for n in policy.contract.inputs if not n.startswith("carry_")}
 
 
+@pytest.mark.slow
 def test_the_released_file_stands_in_the_deployed_loop(file):
     summary = deploy_episode(file, CONFIG, [("stand", 1.0), ("wave", 0.5)], seed=1)
     assert stayed_up(summary, 1.5), summary
@@ -140,6 +144,7 @@ def test_pushes_keep_to_their_size_and_spare_the_first_second():
     assert max(np.hypot(x, y) for _, (x, y, _) in pushes) <= 0.5
 
 
+@pytest.mark.slow
 def test_the_card_says_what_was_measured(file):
     policy = load_policy(file, trial=0)
     labels = policy.contract.skill_labels
