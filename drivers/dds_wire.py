@@ -7,11 +7,8 @@ A G1 has no watchdog that could be programmed, and what its motors do when LowCm
 but loopback a bus is therefore refused until its wiring says ``watchdog: 0``, by which a person accepts that.
 """
 
-# No ``from __future__ import annotations``: Cyclone reads the types' annotations.
-# Cyclone's annotations are no types to a type checker.
-# pyright: reportInvalidTypeForm=false
+from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -19,7 +16,7 @@ from xml.sax.saxutils import quoteattr
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import DDSException, InstanceState, Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
-from cyclonedds.idl import IdlStruct
+from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl.annotations import autoid, final
 from cyclonedds.idl.types import array, float32, int16, int32, int64, sequence, uint8, uint32
 from cyclonedds.pub import DataWriter
@@ -37,141 +34,40 @@ DEPTH = 16  # samples kept until they are read
 ENDPOINTS = 1000  # of other programs, looked at
 
 
-# The types as unitree_sdk2 declares them: DDS compares their names, members and kinds before two programs may talk.
+def _type(name: str, **fields: Any) -> Any:
+    """A type as unitree_sdk2 declares it: DDS compares names, members and kinds before two programs may talk."""
+    package = "unitree_api" if name.startswith("Re") else "unitree_hg"
+    return autoid("sequential")(final(make_idl_struct(name, f"{package}.msg.dds_.{name}", fields)))
 
 
-@dataclass
-@final
-@autoid("sequential")
-class MotorCmd(IdlStruct, typename="unitree_hg.msg.dds_.MotorCmd_"):
-    mode: uint8
-    q: float32
-    dq: float32
-    tau: float32
-    kp: float32
-    kd: float32
-    reserve: uint32
+MotorCmd = _type(
+    "MotorCmd_", mode=uint8, q=float32, dq=float32, tau=float32, kp=float32, kd=float32, reserve=uint32
+)  # fmt: skip
+ImuState = _type(
+    "IMUState_", quaternion=array[float32, 4], gyroscope=array[float32, 3], accelerometer=array[float32, 3],
+    rpy=array[float32, 3], temperature=int16,
+)  # fmt: skip
+MotorState = _type(
+    "MotorState_", mode=uint8, q=float32, dq=float32, ddq=float32, tau_est=float32, temperature=array[int16, 2],
+    vol=float32, sensor=array[uint32, 2], motorstate=uint32, reserve=array[uint32, 4],
+)  # fmt: skip
+LowCmd = _type(
+    "LowCmd_", mode_pr=uint8, mode_machine=uint8, motor_cmd=array[MotorCmd, hg.SLOTS], reserve=array[uint32, 4], crc=uint32
+)  # fmt: skip
+LowState = _type(
+    "LowState_", version=array[uint32, 2], mode_pr=uint8, mode_machine=uint8, tick=uint32, imu_state=ImuState,
+    motor_state=array[MotorState, hg.SLOTS], wireless_remote=array[uint8, 40], reserve=array[uint32, 4], crc=uint32,
+)  # fmt: skip
+RequestIdentity = _type("RequestIdentity_", id=int64, api_id=int64)
+RequestLease = _type("RequestLease_", id=int64)
+RequestPolicy = _type("RequestPolicy_", priority=int32, noreply=bool)
+RequestHeader = _type("RequestHeader_", identity=RequestIdentity, lease=RequestLease, policy=RequestPolicy)
+Request = _type("Request_", header=RequestHeader, parameter=str, binary=sequence[uint8])
+ResponseStatus = _type("ResponseStatus_", code=int32)
+ResponseHeader = _type("ResponseHeader_", identity=RequestIdentity, status=ResponseStatus)
+Response = _type("Response_", header=ResponseHeader, data=str, binary=sequence[uint8])
 
-
-@dataclass
-@final
-@autoid("sequential")
-class ImuState(IdlStruct, typename="unitree_hg.msg.dds_.IMUState_"):
-    quaternion: array[float32, 4]
-    gyroscope: array[float32, 3]
-    accelerometer: array[float32, 3]
-    rpy: array[float32, 3]
-    temperature: int16
-
-
-@dataclass
-@final
-@autoid("sequential")
-class MotorState(IdlStruct, typename="unitree_hg.msg.dds_.MotorState_"):
-    mode: uint8
-    q: float32
-    dq: float32
-    ddq: float32
-    tau_est: float32
-    temperature: array[int16, 2]
-    vol: float32
-    sensor: array[uint32, 2]
-    motorstate: uint32
-    reserve: array[uint32, 4]
-
-
-@dataclass
-@final
-@autoid("sequential")
-class LowCmd(IdlStruct, typename=hg.COMMAND_TYPE):
-    mode_pr: uint8
-    mode_machine: uint8
-    motor_cmd: array[MotorCmd, hg.SLOTS]
-    reserve: array[uint32, 4]
-    crc: uint32
-
-
-@dataclass
-@final
-@autoid("sequential")
-class LowState(IdlStruct, typename=hg.STATE_TYPE):
-    version: array[uint32, 2]
-    mode_pr: uint8
-    mode_machine: uint8
-    tick: uint32
-    imu_state: ImuState
-    motor_state: array[MotorState, hg.SLOTS]
-    wireless_remote: array[uint8, 40]
-    reserve: array[uint32, 4]
-    crc: uint32
-
-
-@dataclass
-@final
-@autoid("sequential")
-class RequestIdentity(IdlStruct, typename="unitree_api.msg.dds_.RequestIdentity_"):
-    id: int64
-    api_id: int64
-
-
-@dataclass
-@final
-@autoid("sequential")
-class RequestLease(IdlStruct, typename="unitree_api.msg.dds_.RequestLease_"):
-    id: int64
-
-
-@dataclass
-@final
-@autoid("sequential")
-class RequestPolicy(IdlStruct, typename="unitree_api.msg.dds_.RequestPolicy_"):
-    priority: int32
-    noreply: bool
-
-
-@dataclass
-@final
-@autoid("sequential")
-class RequestHeader(IdlStruct, typename="unitree_api.msg.dds_.RequestHeader_"):
-    identity: RequestIdentity
-    lease: RequestLease
-    policy: RequestPolicy
-
-
-@dataclass
-@final
-@autoid("sequential")
-class Request(IdlStruct, typename=api.REQUEST_TYPE):
-    header: RequestHeader
-    parameter: str
-    binary: sequence[uint8]
-
-
-@dataclass
-@final
-@autoid("sequential")
-class ResponseStatus(IdlStruct, typename="unitree_api.msg.dds_.ResponseStatus_"):
-    code: int32
-
-
-@dataclass
-@final
-@autoid("sequential")
-class ResponseHeader(IdlStruct, typename="unitree_api.msg.dds_.ResponseHeader_"):
-    identity: RequestIdentity
-    status: ResponseStatus
-
-
-@dataclass
-@final
-@autoid("sequential")
-class Response(IdlStruct, typename=api.RESPONSE_TYPE):
-    header: ResponseHeader
-    data: str
-    binary: sequence[uint8]
-
-
-TYPES: dict[str, type[IdlStruct]] = {
+TYPES: dict[str, Any] = {
     hg.COMMAND_TOPIC: LowCmd,
     hg.STATE_TOPIC: LowState,
     api.MOTION_REQUEST: Request,
@@ -189,7 +85,7 @@ class Payload:
         return self.payload
 
     @classmethod
-    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> "Payload":
+    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Payload:
         return cls(data)
 
     deserialize_key = deserialize

@@ -15,8 +15,6 @@ from typing import NamedTuple
 
 from drivers.codecs.unitree_hg import CDR_HEADER
 
-REQUEST_TYPE = "unitree_api.msg.dds_.Request_"
-RESPONSE_TYPE = "unitree_api.msg.dds_.Response_"
 MOTION_REQUEST, MOTION_RESPONSE = "rt/api/motion_switcher/request", "rt/api/motion_switcher/response"
 CHECK_MODE, RELEASE_MODE = 1001, 1003  # answered with {"form": ..., "name": the controller in charge, "": none}
 

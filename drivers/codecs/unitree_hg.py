@@ -26,8 +26,7 @@ import numpy as np
 
 from drivers.bus import BusError, BusSpec, MotorCommand, MotorState
 
-COMMAND_TOPIC, COMMAND_TYPE = "rt/lowcmd", "unitree_hg.msg.dds_.LowCmd_"
-STATE_TOPIC, STATE_TYPE = "rt/lowstate", "unitree_hg.msg.dds_.LowState_"
+COMMAND_TOPIC, STATE_TOPIC = "rt/lowcmd", "rt/lowstate"
 SLOTS = 35  # motors in a message
 CDR_HEADER = bytes([0, 1, 0, 0])  # XCDR1, little-endian
 SERIES_JOINTS = 0  # mode_pr: ankles and waist as pitch and roll joints; 1: as their two motors

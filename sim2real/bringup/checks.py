@@ -40,6 +40,8 @@ G1_NETWORK = "192.168.123."
 
 
 class Level(IntEnum):
+    """How bad a finding is."""
+
     OK = 0
     WARN = 1
     FAIL = 2
@@ -77,6 +79,7 @@ class Question:
 
 
 def ok(what: str, said: str) -> Finding:
+    """A finding with which all is well."""
     return Finding(Level.OK, what, said)
 
 
