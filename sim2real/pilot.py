@@ -131,7 +131,7 @@ def main(directory: Path) -> int:
             tell(f"kept the current skill: {refusal.skill}: {refusal.reason}")
         refused = len(player.refusals)
 
-    keep_time(tick, player.period, spec, 70, life.goes_on, PHASE)
+    keep_time(tick, player.period, spec, 70, life.goes_on, PHASE, cpu=0)
     return 0
 
 

@@ -93,15 +93,17 @@ def keep_time(
     priority: int,
     goes_on: Callable[[], bool],
     phase: float = 0.0,
+    cpu: int = -1,
 ) -> None:
     """Call ``tick(scheduled, lateness, late)`` on an absolute schedule while ``goes_on()``.
 
     Ticks are due at whole periods of the monotonic clock plus ``phase`` (s), so that processes agree without talking.
+    ``cpu``: which of the permitted ones to stay on, counted as a list's index.
     """
     clock = MonotonicClock()
     cpus = sorted(os.sched_getaffinity(0))
     if spec.tune:
-        granted = tune(priority, cpus[-1] if len(cpus) > 1 else None)
+        granted = tune(priority, cpus[cpu] if len(cpus) > 1 else None)
         clock.spin = granted.spin
         tell(f"tuned: {granted}", tuning=str(granted))
     schedule = Schedule(clock, period)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
 from sim2real.clock import tune
 from sim2real.run import Life, RunSpec, tell
 
-PRIORITY = 60  # below the guardian's and the pilot's
+PRIORITY = 60  # below the guardian's and the pilot's; on whichever CPU they leave free
 
 
 def main(directory: Path) -> int:
@@ -31,8 +30,8 @@ def main(directory: Path) -> int:
         joint_pos=dict(zip(config.joint_names, config.home_pos, strict=True)),
     )
     world.advance(SETTLE)
-    if spec.tune:  # real motors do not wait for other programs either; the loops have the other core
-        tune(PRIORITY, min(os.sched_getaffinity(0)), spin=0.0)
+    if spec.tune:  # real motors do not wait for other programs either
+        tune(PRIORITY, spin=0.0)
     said = False
 
     def goes_on() -> bool:

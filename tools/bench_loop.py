@@ -24,8 +24,9 @@ from sim2real.types import Mode, Sim2realError
 
 SECONDS, TURNS = 20, 3
 FACTOR = 1.5
-RATES = {"/tick": ("bus", 250.0, 80), "/pilot": ("policy", 50.0, 70)}  # topic: name, Hz, SCHED_FIFO priority
-CPU = max(os.sched_getaffinity(0))  # where the loops are pinned
+CPUS = sorted(os.sched_getaffinity(0))
+# Topic: what, Hz, SCHED_FIFO priority, and the CPU it is pinned to, as sim2real/guardian.py and sim2real/pilot.py have it.
+LOOPS = {"/tick": ("bus", 250.0, 80, CPUS[-1]), "/pilot": ("policy", 50.0, 70, CPUS[0])}
 
 
 def rows() -> Iterator[Row]:
@@ -40,22 +41,23 @@ def rows() -> Iterator[Row]:
 
 def measure(load: str, tuned: bool) -> Iterator[Row]:
     """Ours and the floor in turns, under one load."""
-    ours: dict[str, list[np.ndarray]] = {topic: [] for topic in RATES}
-    floor: dict[str, list[np.ndarray]] = {topic: [] for topic in RATES}
+    ours: dict[str, list[np.ndarray]] = {topic: [] for topic in LOOPS}
+    floor: dict[str, list[np.ndarray]] = {topic: [] for topic in LOOPS}
     summaries = []
     with hogs(os.cpu_count() or 1) if load != "quiet" else nullcontext():
         for _ in range(TURNS):
             sleepers = {
-                t: Sleeper(rate, SECONDS, priority if tuned else 0, CPU) for t, (_, rate, priority) in RATES.items()
+                t: Sleeper(rate, SECONDS, priority if tuned else 0, cpu)
+                for t, (_, rate, priority, cpu) in LOOPS.items()
             }
             for topic, sleeper in sleepers.items():
                 floor[topic].append(sleeper.lateness())
             summary, lateness = run(tuned)
             summaries.append(summary)
-            for topic in RATES:
+            for topic in LOOPS:
                 ours[topic].append(lateness[topic])
     words = f"{load}, {'tuned' if tuned else 'untuned'}"
-    for topic, (name, rate, _) in RATES.items():
+    for topic, (name, rate, *_) in LOOPS.items():
         q, least = quantiles(np.concatenate(ours[topic])), quantiles(np.concatenate(floor[topic]))
         ratios = [a / b for a, b in zip(q, least, strict=True)]
         yield Row(
