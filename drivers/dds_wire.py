@@ -7,6 +7,9 @@ A G1 has no watchdog that could be programmed, and what its motors do when LowCm
 but loopback a bus is therefore refused until its wiring says ``watchdog: 0``, by which a person accepts that.
 """
 
+# An extra: absent where nobody asked for it.
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 from functools import cache

@@ -26,6 +26,7 @@ ONLY_IN = {
     "mujoco": ("drivers/sim/plant.py", "drivers/sim/camera.py"),
     "can": ("drivers/can_wire.py", "drivers/open.py", "drivers/sim/*.py"),
     "serial": ("drivers/serial_wire.py",),
+    "cyclonedds": ("drivers/dds_wire.py",),
 }
 WALL_CLOCK = {"time.time", "time.time_ns", "datetime.now", "datetime.utcnow", "datetime.datetime.now", "datetime.today"}
 WALL_CLOCK_IN = ("sim2real/recorder/*.py", "sim2real/cli/deploy.py")  # the date of a record, and nothing else
