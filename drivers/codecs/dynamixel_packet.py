@@ -50,12 +50,12 @@ def crc_table() -> np.ndarray:
 
     With an initial value of 0 the CRC is linear over GF(2): that of a packet is the exclusive or of those of its bytes.
     """
-    crc = np.arange(256, dtype=np.uint32) << 8
-    rows = []
-    for _ in range(LENGTH_MAX + 8):
-        for _ in range(8):
-            crc = (crc << 1 ^ np.where(crc & 0x8000, 0x8005, 0)) & 0xFFFF
-        rows.append(crc.astype(np.uint16))
+    last = np.arange(256, dtype=np.uint16) << 8
+    for _ in range(8):
+        last = last << 1 ^ np.where(last & 0x8000, 0x8005, 0).astype(np.uint16)
+    rows = [last]
+    while len(rows) < LENGTH_MAX + 8:  # one place further from the end: eight steps more
+        rows.append(rows[-1] << 8 ^ last[rows[-1] >> 8])
     return np.ascontiguousarray(rows[::-1]).reshape(-1)
 
 
@@ -97,10 +97,12 @@ def pack_status(id: int, error: int, parameters: bytes = b"") -> bytes:
 
 
 def pack_read(id: int, address: int, size: int) -> bytes:
+    """Ask one servo for ``size`` bytes."""
     return pack(id, Instruction.READ, np.array([address, size], "<u2").tobytes())
 
 
 def pack_write(id: int, address: int, data: bytes) -> bytes:
+    """Write ``data`` to one servo, which answers."""
     return pack(id, Instruction.WRITE, address.to_bytes(2, "little") + data)
 
 

@@ -102,8 +102,8 @@ def serve_servos(spec: BusSpec, *, instant: bool = False, fast: bool = True, fau
     fault."""
     body = Wheels(len(spec.motors))
     servos = SimServos(spec, body, fast=fast)
-    timing = {"latency": 0.0, "gap": 0.0} if instant else {"latency": 0.0}
-    line = SerialLine(replace(spec, bitrate=INSTANT) if instant else spec, servos, **timing)
+    slow = SerialLine(spec, servos, latency=0.0)
+    line = SerialLine(replace(spec, bitrate=INSTANT), servos, latency=0.0, gap=0.0) if instant else slow
     for fault in faults:
         line.inject(parse_fault(fault))
     return PtyServer(line, body)

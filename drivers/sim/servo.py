@@ -14,7 +14,7 @@ Velocity mode is a stiff damper towards its goal, for the gains' units are not p
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 
 import numpy as np
@@ -230,7 +230,7 @@ class SimServos:
                 self._write(row, address, data, time)
         yield from ()
 
-    _ACTIONS = {
+    _ACTIONS: dict[int, Callable] = {
         Instruction.PING: _ping,
         Instruction.READ: _read_one,
         Instruction.WRITE: _write_one,
