@@ -187,9 +187,9 @@ def pack_answer(answers: Answers) -> np.ndarray:
 def unpack_answer(data: np.ndarray) -> tuple[Answers, np.ndarray]:
     """What payloads (m, 24) uint8 say, and which of them (m,) are whole answers with finite motion."""
     frames = np.ascontiguousarray(data).view(ANSWER)[:, 0]
-    sound = np.isfinite(frames["motion"]).all(axis=1)
+    sound = np.asarray(np.isfinite(frames["motion"]).all(axis=1))
     for name, head in ANSWER_HEADS.items():
-        sound &= (frames[name] == np.array(head, np.uint8)).all(axis=1)
+        np.logical_and(sound, (frames[name] == np.array(head, np.uint8)).all(axis=1), out=sound)
     with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN
         position, velocity, torque = frames["motion"].T.astype(float)
     state = frames["temperature"].astype(float), frames["fault"].astype(np.int64)

@@ -175,7 +175,7 @@ class OdriveCodec:
         _check_ids(spec)
         n = len(spec.motors)
         self.checks: list[RegisterCheck] = []  # CANSimple 0.5 has nothing to read back
-        self._models = [Model(*model_of(m, MODELS, "odrive.py")) for m in spec.motors]
+        self._models = [model_of(m, MODELS, "odrive.py") for m in spec.motors]
         self._gear = np.array([m.gear for m in self._models])
         self._torque_per_ampere = np.array([m.torque_constant * m.gear for m in self._models])
         self._nodes = np.array([m.id for m in spec.motors], np.uint32)
@@ -224,7 +224,7 @@ class OdriveCodec:
         frames = []
         for quantity, row in np.argwhere(due):
             command = (Command.SET_POS_GAIN, Command.SET_VEL_GAINS)[quantity]
-            frames.append(pack_pair(int(self._nodes[row]), command, wanted[quantity, row], 0.0))
+            frames.append(pack_pair(int(self._nodes[row]), command, float(wanted[quantity, row]), 0.0))
         return frames
 
     def _pack_questions(self) -> np.ndarray:
@@ -326,7 +326,7 @@ class OdriveMotors:
     """The motors' side: the frames that emulated axes answer with."""
 
     def __init__(self, spec: BusSpec) -> None:
-        models = [Model(*model_of(m, MODELS, "odrive.py")) for m in spec.motors]
+        models = [model_of(m, MODELS, "odrive.py") for m in spec.motors]
         self.nodes = [m.id for m in spec.motors]
         self.gear = np.array([m.gear for m in models])
         self.torque_constant = np.array([m.torque_constant for m in models])

@@ -23,8 +23,9 @@ by model, and the example of reading loc_kp), and of the CyberGear.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Mapping
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -39,6 +40,7 @@ TIMEOUT_TICK = 50e-6  # s, unit of canTimeout: 20000 are 1 s
 TEMPERATURE_UNIT = 0.1  # deg C
 FULL_TURNS = 4 * np.pi  # rad: full scale of position, every model
 CODE_MAX = 0xFFFF
+Row = TypeVar("Row")  # of a table of models
 
 
 class Model(NamedTuple):
@@ -182,7 +184,7 @@ def timeout_ticks(seconds: float) -> int:
     return max(1, round(seconds / TIMEOUT_TICK))
 
 
-def model_of(motor: MotorSpec, models: dict, file: str) -> tuple:
+def model_of(motor: MotorSpec, models: Mapping[str, Row], file: str) -> Row:
     """The row of ``models`` (in codec ``file``) for this motor. Raises BusError listing those that there are."""
     if motor.model not in models:
         close = difflib.get_close_matches(motor.model, models, n=1)
@@ -220,7 +222,7 @@ class Scales:
 
     def values(self, codes: np.ndarray, quantities: list[int], rows: np.ndarray) -> np.ndarray:
         """(len(quantities), m) SI values of codes of motors ``rows`` (m,)."""
-        at = np.ix_(quantities, rows)
+        at = np.array(quantities)[:, None], rows
         return self.low[at] + codes * self.lsb[at]
 
 

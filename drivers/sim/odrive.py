@@ -140,8 +140,9 @@ class SimOdrive(SimMotors):
     def _targets(self) -> MotorCommand:
         column = lambda name: np.array([r[name] for r in self._registers])  # noqa: E731
         usual = (column("CONTROL_MODE") == odrive.POSITION_CONTROL) & (column("INPUT_MODE") == odrive.PASSTHROUGH)
-        gains = column("POS_GAIN") * usual, column("VEL_GAIN") * usual
-        return odrive.command_of(Law(*self._inputs, *gains), self._codec.gear)
+        position, velocity, torque = self._inputs
+        law = Law(position, velocity, torque, column("POS_GAIN") * usual, column("VEL_GAIN") * usual)
+        return odrive.command_of(law, self._codec.gear)
 
     def _fail(self, row: int, error: int, now: float, event: str) -> None:
         self.error[row] |= error
