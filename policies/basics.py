@@ -73,7 +73,7 @@ class Basics:
     episode: float = 10.0  # s
     switch: tuple[float, float] = (1.5, 5.0)  # s between skill switches
     push: tuple[float, float] = (1.5, 4.0)  # s between pushes
-    push_speed: tuple[float, float] = (0.2, 0.9)  # m/s, the largest at curriculum level 0 and 1
+    push_speed: tuple[float, float] = (0.2, 0.8)  # m/s, the largest at curriculum level 0 and 1
     push_least: float = 0.0  # share of the largest push that each has at least
     push_turn: float = 0.6  # rad/s per m/s of push
     home_start: float = 0.2  # share of episodes that start at home instead of inside a motion

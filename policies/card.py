@@ -148,6 +148,7 @@ Measured by `sim2real eval`; do not edit. sha256 `{e.sha256}`
 {1 / contract.period:.0f} Hz, {len(contract.target_joint_names)} joints. In: {", ".join(n for n in contract.inputs if not n.startswith("carry_"))}.
 Legs and waist balance around a reference pose that every skill gives by formula (`policies/basics.py`); arms follow it.
 Trained by {training.get("algorithm", "?")} on {float(training.get("samples", 0)) / 1e6:.1f} M samples, seed {training.get("seed", "?")}, revision {contract.provenance.revision[:12]}.
+{training.get("note", "")}
 
 ## Survival
 

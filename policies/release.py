@@ -56,7 +56,13 @@ def release(folder: Path, path: Path, checkpoint: str = "best.pt") -> Policy:
             "revision": document["revision"] or git_revision(),
             "licence": "Apache-2.0",
             "tools": document["tools"],
-            "training": {"algorithm": "PPO (rsl_rl)", "seed": config.seed, "timestep": config.timestep, **row},
+            "training": {
+                "algorithm": "PPO (rsl_rl)",
+                "seed": config.seed,
+                "timestep": config.timestep,
+                **row,
+                **({"note": document["note"]} if "note" in document else {}),  # of who ran it, about how
+            },
         },
     }
     return export(graph, path, fields=fields, sequences=golden_sequences(graph))
