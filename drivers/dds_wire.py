@@ -209,7 +209,7 @@ def open_dds(spec: BusSpec | ImuSpec) -> CycloneWire | StateStream:
     if interface != LOOPBACK and spec.watchdog:
         raise WireError(
             f"got watchdog {spec.watchdog:g} s, but the motors of a G1 have none that could be programmed, and what they "
-            "do when commands stop is undocumented\n  Hang the robot up, keep its remote at hand (L2+B: damping), and say "
+            "do when commands stop is undocumented\n  Hang the robot up, keep its remote and its power switch at hand, and say "
             "'watchdog: 0' in the wiring to accept that"
         )
     return CycloneWire(interface, number, (hg.STATE_TOPIC, api.MOTION_RESPONSE), (hg.COMMAND_TOPIC, api.MOTION_REQUEST))
