@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -116,7 +117,7 @@ class SimServos:
         if packet.instruction == Instruction.STATUS:
             return []
         self._fed = time
-        act = self._ACTIONS.get(packet.instruction)
+        act: Callable[..., Iterator[Any]] | None = self._ACTIONS.get(packet.instruction)
         if act is None:
             rows = self._addressed(packet.id, time) if packet.id != BROADCAST else []
             return [self._answer(row, StatusError.INSTRUCTION) for row in rows]
