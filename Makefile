@@ -59,5 +59,5 @@ $(VENV)/.base: pyproject.toml constraints.txt | $(BIN)/python
 
 $(VENV)/.all: pyproject.toml constraints.txt | $(BIN)/python
 	@echo "installing training and development tools into $(VENV): once"
-	$(INSTALL) --editable '.[train,dev]'
+	$(INSTALL) --editable '.[train,dds,dev]'
 	@touch $@ $(VENV)/.base
