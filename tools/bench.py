@@ -17,7 +17,7 @@ from drivers.bus import BusError
 from drivers.wire import WireError
 from sim2real.types import Sim2realError
 
-BENCHES = ("codec", "unitree", "policy", "lockstep", "walk", "loop")  # tools/bench_<name>.py, each with rows()
+BENCHES = ("codec", "unitree", "dynamixel", "policy", "lockstep", "walk", "loop")  # tools/bench_<name>.py, each with rows()
 
 
 @dataclass
@@ -25,7 +25,7 @@ class Args:
     """Which benchmarks to run, and where to write the figures."""
 
     only: tyro.conf.Positional[tuple[str, ...]] = field(default=BENCHES)
-    """Benchmarks to run: codec unitree policy lockstep walk loop."""
+    """Benchmarks to run: codec unitree dynamixel policy lockstep walk loop."""
     json: Path = Path("runs/bench.json")
     """The same figures for a program to read."""
 
