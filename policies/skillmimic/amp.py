@@ -42,7 +42,7 @@ class Discriminator:
     batch = 1024
     steps = 8  # a learning round
     memory = 100_000  # transitions of the robots that are kept
-    penalty = 5.0  # of the squared gradient at the clips' transitions
+    penalty = 0.5  # of the squared gradient at the clips' transitions
     ceiling = 0.99  # of D: the reward ends at 4.6, and is divided by that
 
     def __init__(self, clips: ReferenceClips, substeps: int, seed: int) -> None:
@@ -51,7 +51,7 @@ class Discriminator:
         torch.manual_seed(seed)
         size = 2 * features(clips.motion(np.zeros(1, int), np.ones(1))).shape[1]
         self.network = nn.Sequential(nn.Linear(size, 256), nn.ELU(), nn.Linear(256, 128), nn.ELU(), nn.Linear(128, 1))
-        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=2e-4, weight_decay=1e-4)
+        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=5e-4, weight_decay=1e-4)
         self._robots: deque[np.ndarray] = deque()
 
     def reward(self, transitions: np.ndarray) -> np.ndarray:
@@ -84,7 +84,9 @@ class Discriminator:
             self.optimizer.zero_grad()
             total.backward()
             self.optimizer.step()
-            rows.append((float(loss), float((says_fake < 0).float().mean()), float((says_real > 0).float().mean())))
+            rows.append(
+                (float(loss.detach()), float((says_fake < 0).float().mean()), float((says_real > 0).float().mean()))
+            )
         mean = np.mean(rows, axis=0)
         return {"loss_discriminator": float(mean[0]), "robots_found": float(mean[1]), "clips_found": float(mean[2])}
 
