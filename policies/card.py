@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from policies.basics import MOTIONS, Basics
 from policies.evaluate import (
@@ -75,6 +76,7 @@ def evaluate(path: Path, config: Basics, episodes: int, deployed: int, tell: Tel
 
     Raises Sim2realError if the file is refused or was made with other settings.
     """
+    torch.set_num_threads(1)  # small networks: more threads only wait for each other
     labels = list(MOTIONS)
     pairs, switches = switch_script(config, len(labels), max(1, episodes // 5))
     skills = skill_script(config, len(labels), episodes, SECONDS)
