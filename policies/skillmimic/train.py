@@ -10,7 +10,7 @@ import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -128,7 +128,8 @@ def load_config(folder: Path) -> SkillMimic:
     known = {f.name for f in dataclasses.fields(SkillMimic)}
     if strangers := sorted(set(document) - known):
         raise Sim2realError(f"{path}: unknown settings {', '.join(strangers)}; the run was made by another version")
-    return SkillMimic(**{k: tuple(v) if isinstance(v, list) else v for k, v in document.items()})
+    settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in document.items()}
+    return SkillMimic(**settings)
 
 
 def load_graph(folder: Path, name: str = "best.pt") -> PolicyGraph:
@@ -166,7 +167,7 @@ def main(argv: list[str]) -> int:
     if args.task not in TASKS:
         raise Sim2realError(f"task: got '{args.task}', expected one of {', '.join(TASKS)}")
     folder = args.folder or Path("runs") / args.task
-    given = {k: getattr(args, k) for k in ("variant", "samples", "envs", "threads", "seed")}
+    given: dict[str, Any] = {k: getattr(args, k) for k in ("variant", "samples", "envs", "threads", "seed")}
     config = load_config(folder) if (folder / "config.json").is_file() else TASKS[args.task]
     config = dataclasses.replace(config, **{k: v for k, v in given.items() if v is not None})
     if config.variant == "deepmimic":
