@@ -104,7 +104,7 @@ class ContactGraph:
     def node_values(self, touching: np.ndarray) -> np.ndarray:
         """(..., nodes) bool: whether a node touches any other, from edges (..., edges); what the paper's nodes store."""
         incident = np.array([[node in edge for node in self.nodes] for edge in self.edges])
-        return (touching[..., None] & incident).any(axis=-2)
+        return np.any(touching[..., None] & incident, axis=-2)
 
 
 def can_touch(a: mujoco.MjsGeom, b: mujoco.MjsGeom) -> bool:

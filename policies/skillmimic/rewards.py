@@ -108,7 +108,7 @@ def body(s: Step, k: Sensitivity) -> np.ndarray:
     return body_position(s, k) * body_rotation(s, k) * body_velocity(s, k) * joint_velocity(s, k)
 
 
-def object_(s: Step, k: Sensitivity) -> np.ndarray:
+def object_motion(s: Step, k: Sensitivity) -> np.ndarray:
     """r^o, equation 6."""
     return object_position(s, k) * object_velocity(s, k)
 
@@ -155,7 +155,7 @@ def mean(terms: np.ndarray) -> np.ndarray:
 
 _FULL: dict[str, SubReward] = {
     "body": body,
-    "object": object_,
+    "object": object_motion,
     "relative": relative,
     "regulariser": regulariser,
     "contact": contact,
@@ -164,7 +164,7 @@ _DEEPMIMIC: dict[str, SubReward] = {
     "body_position": body_position,
     "body_rotation": body_rotation,
     "joint_velocity": joint_velocity,
-    "object": object_,
+    "object": object_motion,
 }
 VARIANTS: dict[str, Variant] = {
     "skillmimic": Variant(_FULL, product, "2"),
