@@ -270,6 +270,9 @@ class Env(VecEnv):
         self.target[ids] = _tensor(self.clips.target[rows])
         self.action[ids], self.history[ids] = 0.0, 0.0
         self._lost[ids] = 0
+        back = conjugate(qpos[:, 3:7])
+        self._seen[ids, :3] = rotate(back, qpos[:, BALL] - qpos[:, :3])
+        self._seen[ids, 3:] = rotate(back, qvel[:, FLIGHT] - qvel[:, :3])
         before = self.clips.motion(*self.clips.rows(self.clip[ids], np.maximum(self.row[ids] - 1, 0)))
         self._last_points[ids] = before.points
         if self.discriminator is not None:

@@ -193,6 +193,14 @@ def test_a_ball_out_of_sight_is_where_it_was_last_seen(env):
         assert not same.any() if seen else same.all()
 
 
+def test_a_ball_lost_from_the_first_tick_is_not_where_the_last_episodes_was(env):
+    env._seen[:] = 9.0
+    env._start(np.arange(env.num_envs))
+    env._lost[:] = 3
+    env._observe()
+    assert np.abs(env.inputs["object_position_in_base"].numpy()).max() < 0.5
+
+
 def test_the_exported_graph_is_the_environments(graph, env):
     graph.actor = torch.nn.Linear(env.observation.shape[1], env.num_actions)
     torch.manual_seed(0)
