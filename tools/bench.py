@@ -17,7 +17,15 @@ from drivers.bus import BusError
 from drivers.wire import WireError
 from sim2real.types import Sim2realError
 
-BENCHES = ("codec", "unitree", "dynamixel", "policy", "lockstep", "walk", "loop")  # tools/bench_<name>.py, each with rows()
+BENCHES = (
+    "codec",
+    "unitree",
+    "dynamixel",
+    "policy",
+    "lockstep",
+    "walk",
+    "loop",
+)  # tools/bench_<name>.py, each with rows()
 
 
 @dataclass

@@ -127,8 +127,8 @@ class MitCodec:
         velocity: np.ndarray,
         torque: np.ndarray,
         byte0: np.ndarray,
-        byte6: np.ndarray,
-        byte7: np.ndarray,
+        byte6: np.ndarray | int,
+        byte7: np.ndarray | int,
         wrap: bool = False,
     ) -> np.ndarray:
         """Replies (n, 8) uint8 of finite arrays (n,) in SI units; ``byte0``, ``byte6``, ``byte7`` are cut to 8 bits.

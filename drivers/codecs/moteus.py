@@ -48,6 +48,8 @@ class Mode(IntEnum):
 
 
 class Register(IntEnum):
+    """Registers that the codec reads or writes."""
+
     MODE = 0x000
     POSITION = 0x001  # rev
     VELOCITY = 0x002  # rev/s

@@ -87,6 +87,8 @@ class Command(IntEnum):
 
 
 class AxisState(IntEnum):
+    """States that the driver asks for or waits for."""
+
     IDLE = 1
     FULL_CALIBRATION = 3
     CLOSED_LOOP = 8

@@ -11,5 +11,7 @@ from drivers.sim.mini_cheetah import SimMiniCheetah
 
 
 class SimCubemars(SimMiniCheetah):
+    """Emulated AK motors."""
+
     MOTORS: ClassVar[type[MiniCheetahMotors]] = CubemarsMotors
     OVER_TEMPERATURE: ClassVar[int] = 1

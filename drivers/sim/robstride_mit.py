@@ -11,4 +11,6 @@ from drivers.sim.mini_cheetah import SimMiniCheetah
 
 
 class SimRobstrideMit(SimMiniCheetah):
+    """Emulated RobStride motors switched to the MIT protocol."""
+
     MOTORS: ClassVar[type[MiniCheetahMotors]] = RobstrideMitMotors

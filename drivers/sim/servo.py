@@ -117,11 +117,13 @@ class SimServos:
         if packet.instruction == Instruction.STATUS:
             return []
         self._fed = time
-        act: Callable[..., Iterator[Any]] | None = self._ACTIONS.get(packet.instruction)
+        act: Any = self._ACTIONS.get(packet.instruction)
         if act is None:
             rows = self._addressed(packet.id, time) if packet.id != BROADCAST else []
-            return [self._answer(row, StatusError.INSTRUCTION) for row in rows]
-        return [answer for answer in act(self, packet, time) if answer is not None]
+            answers = [self._answer(row, StatusError.INSTRUCTION) for row in rows]
+        else:
+            answers = list(act(self, packet, time))
+        return [answer for answer in answers if answer is not None]
 
     def _ping(self, packet: Packet, time: float) -> Iterator[tuple[int, float, bytes] | None]:
         for row in self._addressed(packet.id, time):
