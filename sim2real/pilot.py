@@ -25,8 +25,8 @@ def layout_of(player: SkillPlayer) -> Layout:
     for plan, policy in zip(player.plans, player.policies, strict=True):
         contract = policy.contract
         for name, array in plan.inputs.items():
-            size = array[0].size
-            known = {"joint_pos": contract.joint_names, "joint_vel": contract.joint_names, "skill": player.labels}
+            size = array.size
+            known = {"joint_pos": contract.joint_names, "joint_vel": contract.joint_names, "skill": contract.skill_labels}
             elements = known.get(name) or (VECTOR if size == 3 else tuple(f"e{i}" for i in range(size)))
             key = f"{policy.contract.name}.{name}"
             inputs[key] = tuple(elements[:size])
@@ -87,7 +87,7 @@ class Pilot:
         r["operator.age"] = start - wish.time
         name = player.policies[player.policy_index].contract.name
         for signal, array in player.inputs.items():
-            r[f"input.{name}.{signal}"][0] = array[0]
+            r[f"input.{name}.{signal}"][0] = array
         r["skill_value"][0] = player.values
         r["timing.lateness"], r["timing.policy"], r["timing.total"] = lateness, after - before, clock.now() - start
         self.published.write(r)

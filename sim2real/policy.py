@@ -91,7 +91,10 @@ class Policy:
                     f"{self.path}: step: no input '{name}', expected {', '.join(self._signals)}; this robot does not"
                     " provide that signal"
                 )
-            array[...] = inputs[name]
+            given = inputs[name]
+            if np.shape(given) != array.shape:  # numpy would spread a single value over all
+                raise ValueError(f"{self.path}: step: '{name}' has shape {np.shape(given)}, expected {array.shape}")
+            array[...] = given
         self._session.run_with_iobinding(self._binding)
         for carry, after in self._carries:
             carry[...] = after

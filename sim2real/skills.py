@@ -231,7 +231,7 @@ class _Plan:
         self._low = np.array(contract.command_velocity_min)
         self._high = np.array(contract.command_velocity_max)
         signals = {name: shape for name, shape in contract.inputs.items() if not name.startswith(CARRY)}
-        self.inputs = {name: np.zeros((1, *shape), np.float32) for name, shape in signals.items()}
+        self.inputs = {name: np.zeros(shape, np.float32) for name, shape in signals.items()}
         if strangers := [n for n in signals if n not in _SOURCES]:
             raise Sim2realError(
                 f"{contract.name}: nothing on this robot measures {', '.join(strangers)}; it measures {', '.join(_SOURCES)}"
@@ -241,7 +241,7 @@ class _Plan:
                 f"{contract.name}: needs {' and '.join(objects)}, and nothing tracks an object in this run;"
                 " give it a tracker, with a camera or motion capture that sends sightings (sim2real/object/packet.py)"
             )
-        self._sources = [(_SOURCES[name], self.inputs[name][0]) for name in signals]
+        self._sources = [(_SOURCES[name], self.inputs[name]) for name in signals]
 
     def fill(self, state: RobotState, velocity: tuple[float, float, float], skill: int) -> None:
         for source, out in self._sources:

@@ -17,13 +17,14 @@ import pytest
 import tiny_policy
 from source import ROOT
 
+from drivers.bus import BusError
 from drivers.sim.socket_wire import WorldRemote
 from sim2real.config import load_robot
 from sim2real.launch import Launch
 from sim2real.operators.script import ScriptOperator, Step
 from sim2real.policy import load_policy
 from sim2real.skills import SkillPlayer
-from sim2real.types import Mode, Sim2realError
+from sim2real.types import Mode
 
 PROMISE = 0.1  # s, SAFETY.md sentence 2
 
@@ -157,5 +158,5 @@ def test_a_robot_that_is_not_there_is_refused_and_nothing_moves(tmp_path):
     file = tiny_policy.write(tmp_path / "tiny.onnx", tiny_policy.model(robot), tiny_policy.document(robot))
     player = SkillPlayer(robot, [load_policy(file, robot, trial=0)])
     launch = Launch(robot, player, ScriptOperator([Step("stand", 1.0)]), simulated=False)
-    with pytest.raises(Sim2realError, match="can0"):
+    with pytest.raises(BusError, match="can0"):
         launch.run()

@@ -49,7 +49,7 @@ class Juggler:
     def reset(self) -> None: ...
 
     def step(self, inputs):
-        self.seen.append(np.concatenate([inputs["object_position_in_base"][0], inputs["object_velocity_in_base"][0]]))
+        self.seen.append(np.concatenate([inputs["object_position_in_base"], inputs["object_velocity_in_base"]]))
         return {"joint_pos_target": self.target}
 
 
