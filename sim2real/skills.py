@@ -117,7 +117,8 @@ class SkillPlayer:
 
     def step(self, state: RobotState, mode: Mode, operator: OperatorInput, now: float) -> JointCommand:
         """One policy tick. Returns the same JointCommand object each time; never raises on a bad state: that is the
-        gate's to judge, so a non-finite state yields the previous targets again. So does an object nobody has seen yet."""
+        gate's to judge. A policy is never fed what is not finite (a lost sensor, an object nobody has seen): the command is
+        then not renewed, it grows old, and the guardian holds and damps."""
         if self.tracker is not None:
             self.tracker.estimate(now, state.orientation_base_in_world)
         if mode != Mode.RUN and mode != Mode.HOLD:
@@ -133,8 +134,8 @@ class SkillPlayer:
             self._standby(state)
         elif self.stage == Stage.ENGAGE:
             self._engage(now)
-        else:
-            self._run(state, operator, now)
+        elif not self._run(state, operator, now):
+            return self.command
         self.command.time = now
         return self.command
 
@@ -158,7 +159,8 @@ class SkillPlayer:
         self.policies[self.policy_index].reset()
         self._since = now
 
-    def _run(self, state: RobotState, operator: OperatorInput, now: float) -> None:
+    def _run(self, state: RobotState, operator: OperatorInput, now: float) -> bool:
+        """Let the policy decide. Returns whether it could."""
         if operator.skill is not None and operator.skill != self.labels[self.skill]:
             self._switch(operator.skill, now)
         else:
@@ -168,7 +170,7 @@ class SkillPlayer:
         fresh = now - operator.time <= self.operator_timeout
         plan.fill(state, operator.velocity if fresh else (0.0, 0.0, 0.0), k)
         if not plan.finite():
-            return
+            return False
         outputs = policy.step(plan.inputs)
         c.joint_pos[:] = plan.posture
         c.joint_pos[plan.targets] = outputs["joint_pos_target"]
@@ -180,6 +182,7 @@ class SkillPlayer:
         if "skill_value" in outputs:
             first = self.skill - k
             self.values[first : first + len(policy.contract.skills)] = outputs["skill_value"]
+        return True
 
     def _switch(self, wish: str, now: float) -> None:
         reason = self._objection(wish, now)

@@ -145,15 +145,17 @@ def test_between_two_policies_targets_blend(robot, policy_of):
     assert np.abs(after - before).max() > 0.05
 
 
-def test_a_state_that_is_not_finite_reaches_no_policy(robot, policy_of):
+def test_a_state_that_is_not_finite_reaches_no_policy_and_the_command_grows_old(robot, policy_of):
     player, state = SkillPlayer(robot, [policy_of()]), standing(robot)
     now = to_run(player, state)
     before = player.step(state, Mode.RUN, wish(now), now).joint_pos.copy()
     state.joint_pos[0] = np.nan
-    after = player.step(state, Mode.RUN, wish(now + TICK), now + TICK)
-    np.testing.assert_array_equal(after.joint_pos, before)
+    command = player.step(state, Mode.RUN, wish(now + TICK), now + TICK)
+    np.testing.assert_array_equal(command.joint_pos, before)
+    assert command.time == now
     state.joint_pos[0] = robot.home_pos[0]
-    assert np.isfinite(player.step(state, Mode.RUN, wish(now + 2 * TICK), now + 2 * TICK).joint_pos).all()
+    command = player.step(state, Mode.RUN, wish(now + 2 * TICK), now + 2 * TICK)
+    assert np.isfinite(command.joint_pos).all() and command.time == now + 2 * TICK
 
 
 def test_two_policies_with_one_label_are_refused(robot, policy_of):
