@@ -126,6 +126,16 @@ class Training:
             curve.write_text("".join(x for x in lines if json.loads(x)["iteration"] <= self.iteration))
         return True
 
+    def start_from(self, checkpoint: Path) -> None:
+        """Take the networks and the optimiser of another run; samples and curve begin at zero. Raises Sim2realError."""
+        try:
+            self.ppo.load(torch.load(checkpoint, weights_only=True)["ppo"], None, strict=True)
+        except Exception as error:  # torch has no common base for what a wrong file raises
+            reason = str(error).splitlines()[0]
+            raise Sim2realError(
+                f"{checkpoint}: {reason}; expected a checkpoint of this network (best.pt, last.pt)"
+            ) from None
+
     def _save(self, name: str) -> None:
         state = {
             "ppo": self.ppo.save(),
@@ -223,7 +233,7 @@ def git_revision() -> str:
     return ""
 
 
-def train_command(folder: Path, **settings: float) -> None:
+def train_command(folder: Path, start: Path | None = None, **settings: float) -> None:
     """``sim2real train``: a progress line with the time left, and what the run came to."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -231,6 +241,8 @@ def train_command(folder: Path, **settings: float) -> None:
     config = load_config(folder) if (folder / "config.json").is_file() else Basics()
     training = Training(dataclasses.replace(config, **settings), folder)  # type: ignore[arg-type]
     resumed = training.resume()
+    if start is not None and not resumed:
+        training.start_from(start)
     console = Console()
     console.print(
         f"{'resuming' if resumed else 'training'} in {folder}: {training.env.num_envs} robots, "

@@ -28,6 +28,8 @@ class Args:
     """threads of the physics"""
     seed: int | None = None
     """of everything random"""
+    start: Path | None = None
+    """begin from the networks of this checkpoint (policies/g1/basics.pt, say) instead of from nothing"""
     export: Path | None = None
     """train no further: write the best checkpoint so far to this policy file (.onnx)"""
 
@@ -44,6 +46,7 @@ def main(argv: list[str]) -> int:
         return 0
     training_side("policies.train").train_command(
         folder=folder,
+        start=args.start,
         **{k: getattr(args, k) for k in ("samples", "envs", "threads", "seed") if getattr(args, k) is not None},
     )
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from policies.basics import Basics
 from policies.train import Training, load_config, load_graph
 from sim2real.types import Sim2realError
 
+SHIPPED = Path(__file__).resolve().parents[2] / "policies" / "g1" / "basics.pt"
 TINY = Basics(envs=8, horizon=4, hidden=(16,), save_every=2, evaluate_every=1000, samples=8 * 4 * 4,
               ppo={**Basics().ppo, "num_mini_batches": 2, "num_learning_epochs": 1})  # fmt: skip
 
@@ -59,3 +61,15 @@ def test_a_run_leaves_its_config_and_curve(tmp_path):
 def test_no_checkpoint_is_refused_with_the_next_step(tmp_path):
     with pytest.raises(Sim2realError, match="sim2real train g1-basics"):
         load_graph(tmp_path)
+
+
+def test_a_run_may_start_from_the_shipped_checkpoint_and_refuses_another_file(tmp_path):
+    training = Training(dataclasses.replace(Basics(), envs=2), tmp_path / "run")
+    (tmp_path / "not.pt").write_bytes(b"nothing of the kind")
+    for wrong in ("not.pt", "absent.pt"):
+        with pytest.raises(Sim2realError, match="expected a checkpoint"):
+            training.start_from(tmp_path / wrong)
+    before = {name: value.clone() for name, value in parameters(training).items()}
+    training.start_from(SHIPPED)
+    assert any(not torch.equal(before[name], value) for name, value in parameters(training).items())
+    assert training.samples == 0
