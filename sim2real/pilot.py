@@ -26,7 +26,11 @@ def layout_of(player: SkillPlayer) -> Layout:
         contract = policy.contract
         for name, array in plan.inputs.items():
             size = array.size
-            known = {"joint_pos": contract.joint_names, "joint_vel": contract.joint_names, "skill": contract.skill_labels}
+            known = {
+                "joint_pos": contract.joint_names,
+                "joint_vel": contract.joint_names,
+                "skill": contract.skill_labels,
+            }
             elements = known.get(name) or (VECTOR if size == 3 else tuple(f"e{i}" for i in range(size)))
             key = f"{policy.contract.name}.{name}"
             inputs[key] = tuple(elements[:size])
