@@ -128,7 +128,7 @@ def pilot_layout(joints: Sequence[str], inputs: Mapping[str, Sequence[str]], ski
 
 
 def state_view(record: np.ndarray) -> RobotState:
-    """A RobotState whose arrays are views into ``record``; scalars are copies (write them with ``store_scalars``)."""
+    """A RobotState whose arrays are views into ``record``; scalars are copies, which the caller writes back."""
     r = record[0]
     return RobotState(
         time=float(r["state.time"]),
