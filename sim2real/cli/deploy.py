@@ -72,7 +72,7 @@ def main(argv: list[str]) -> int:
     console = Console()
     config = load_robot(args.robot)
     _check(args, config)
-    policies, paths = _policies(args, config, console)
+    policies = _policies(args, config, console)
     from sim2real.skills import SkillPlayer
 
     player = SkillPlayer(config, policies)
@@ -80,7 +80,7 @@ def main(argv: list[str]) -> int:
     record = None if args.no_record else _record_path(args.record, config.name)
     run = _lockstep if args.clock == "lockstep" else _realtime
     with contextlib.suppress(KeyboardInterrupt):
-        summary = run(args, config, player, policies, paths, operator, record, console)
+        summary = run(args, config, player, policies, operator, record, console)
         if args.json:
             args.json.write_text(json.dumps(summary.as_dict(), indent=1) + "\n")
         from sim2real.console import print_summary
@@ -126,7 +126,7 @@ def _policies(args: Args, config: RobotConfig, console: Console):
             f"[bold]{contract.name}[/] for {contract.robot}: {', '.join(contract.skill_labels)} "
             f"({1 / contract.period:.0f} Hz, {len(contract.target_joint_names)} joints, sha256 {policy.sha256[:12]})"
         )
-    return policies, paths
+    return policies
 
 
 def _operator(args: Args, labels: list[str]):
@@ -156,7 +156,7 @@ def _record_path(where: Path, robot: str) -> Path:
     return where / f"{robot}-{datetime.now():%Y%m%d-%H%M%S}.mcap"
 
 
-def _about(args: Args, config: RobotConfig, policies, paths) -> tuple[dict[str, object], dict[str, bytes]]:
+def _about(args: Args, config: RobotConfig, policies) -> tuple[dict[str, object], dict[str, bytes]]:
     """Metadata and attachments that make a record self-contained."""
     import platform
 
@@ -169,17 +169,15 @@ def _about(args: Args, config: RobotConfig, policies, paths) -> tuple[dict[str, 
         "seed": args.seed,
         "arguments": json.dumps({k: str(v) for k, v in asdict(args).items()}),
         "skills": json.dumps([label for p in policies for label in p.contract.skill_labels]),
-        "policies": json.dumps(
-            [{"file": Path(f).name, "sha256": p.sha256} for p, f in zip(policies, paths, strict=True)]
-        ),
+        "policies": json.dumps([{"file": p.path.name, "sha256": p.sha256} for p in policies]),
         "version": version(),
         "revision": _revision(),
         "python": platform.python_version(),
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
     }
     attachments = {"robot.yaml": config.path.read_bytes(), "run.json": json.dumps(metadata).encode()}
-    for i, path in enumerate(paths):
-        attachments[f"{i}-{Path(path).name}"] = Path(path).read_bytes()
+    for i, policy in enumerate(policies):
+        attachments[f"{i}-{policy.path.name}"] = policy.path.read_bytes()
     return metadata, attachments
 
 
@@ -191,7 +189,7 @@ def _revision() -> str:
     return done.stdout.strip() if done.returncode == 0 else ""
 
 
-def _lockstep(args, config, player, policies, paths, operator, record, console):
+def _lockstep(args, config, player, policies, operator, record, console):
     camera = None
     if args.video:
         if not os.environ.get("DISPLAY"):
@@ -211,7 +209,7 @@ def _lockstep(args, config, player, policies, paths, operator, record, console):
 
     def sink_for(ticks, pilots):
         nonlocal sink
-        sink = Direct(record, {"/tick": ticks, "/pilot": pilots}, *_about(args, config, policies, paths))
+        sink = Direct(record, {"/tick": ticks, "/pilot": pilots}, *_about(args, config, policies))
         return sink
 
     simulation = Simulation(
@@ -239,7 +237,7 @@ def _lockstep(args, config, player, policies, paths, operator, record, console):
     return summary
 
 
-def _realtime(args, config, player, policies, paths, operator, record, console):
+def _realtime(args, config, player, policies, operator, record, console):
     from sim2real.console import Status
     from sim2real.launch import Launch
     from sim2real.operators.keyboard import KEYS
@@ -251,7 +249,7 @@ def _realtime(args, config, player, policies, paths, operator, record, console):
     if record:
         buses = [b.name for b in config.wiring(args.wiring).buses]
         layouts = {"/tick": tick_layout(config.joint_names, buses), "/pilot": layout_of(player)}
-        recorder = Recorder(record, layouts, *_about(args, config, policies, paths))
+        recorder = Recorder(record, layouts, *_about(args, config, policies))
     try:
         with Status(console, KEYS if args.operator == "keyboard" else "") as status:
             launch = Launch(
