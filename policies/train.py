@@ -17,11 +17,13 @@ import numpy as np
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
+from rsl_rl.modules import MLP
 from torch import nn
 
 from policies.basics import Basics
 from policies.env import Env
 from policies.evaluate import quick_survival
+from policies.gait import Stride
 from policies.graph import PolicyGraph
 from policies.mirror import Mirrored, Turn, action_mirror, observation_mirror
 from sim2real.types import Sim2realError
@@ -138,6 +140,7 @@ class Training:
 
     def _save(self, name: str) -> None:
         state = {
+            "config": dataclasses.asdict(self.config),
             "ppo": self.ppo.save(),
             "iteration": self.iteration,
             "samples": self.samples,
@@ -203,25 +206,39 @@ def networks(ppo: PPO) -> tuple[nn.Module, nn.Module]:
 
 def load_graph(folder: Path, name: str = "best.pt") -> PolicyGraph:
     """The policy graph of a finished or running training. Raises Sim2realError."""
-    if not (folder / name).is_file():
-        raise Sim2realError(f"{folder / name}: no such checkpoint; train first: sim2real train g1-basics")
-    config = load_config(folder)
-    training = Training(dataclasses.replace(config, envs=1), folder)
-    training.ppo.load(torch.load(folder / name, weights_only=True)["ppo"], {"actor": True, "critic": True}, strict=True)
-    return training.graph()
+    return graph_of(folder / name)
+
+
+def graph_of(checkpoint: Path) -> PolicyGraph:
+    """The policy graph in a checkpoint, with its networks. Raises Sim2realError."""
+    if not checkpoint.is_file():
+        raise Sim2realError(f"{checkpoint}: no such checkpoint; train first: sim2real train g1-basics")
+    state = torch.load(checkpoint, weights_only=True)
+    graph = PolicyGraph(config_of(state.get("config", {}), checkpoint))
+    size, mirror = graph.outputs()["observation"][0], observation_mirror(graph)
+    for part, outputs, turn in (("actor", len(graph.driven), action_mirror(graph)), ("critic", 1, ([0], [1.0]))):
+        network = Mirrored(MLP(size, outputs, list(graph.config.hidden), "elu"), mirror, turn)
+        weights = state["ppo"][f"{part}_state_dict"]
+        network.load_state_dict({k.removeprefix("mlp."): v for k, v in weights.items() if k.startswith("mlp.")})
+        setattr(graph, part, network)
+    return graph.eval()
 
 
 def load_config(folder: Path) -> Basics:
     """The settings written beside a run's checkpoints. Raises Sim2realError if they are of another version."""
-    document: dict[str, Any] = json.loads((folder / "config.json").read_text())["config"]
-    settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in document.items()}
-    names = {f.name for f in dataclasses.fields(Basics)}
-    if strangers := sorted(set(settings) - names):
+    return config_of(json.loads((folder / "config.json").read_text())["config"], folder / "config.json")
+
+
+def config_of(document: dict[str, Any], where: Path) -> Basics:
+    """Settings as they were written to ``where``. Raises Sim2realError if they are of another version."""
+    try:
+        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in document.items()}
+        return Basics(**{**settings, "stride": Stride(**settings["stride"])})
+    except (TypeError, KeyError) as error:
         raise Sim2realError(
-            f"{folder / 'config.json'}: got settings {', '.join(strangers)}, which policies/basics.py does not have;"
-            " check out the revision named in that file, or train anew in another folder"
-        )
-    return Basics(**settings)
+            f"{where}: its settings are not those of policies/basics.py ({error}); check out the revision that made it,"
+            " or train anew in another folder"
+        ) from None
 
 
 def git_revision() -> str:

@@ -75,20 +75,19 @@ class SkillTraining(Training):
         return row | {f"reward_{name}": float(term.mean()) for name, term in self.env.terms.items()}
 
     def evaluate(self) -> dict[str, float]:
-        """What training selects by."""
+        """What training selects by: the mean over skills, and each of them."""
         config = self.config
-        result = evaluate(self.graph(), config.evaluate_envs, config.evaluate_seconds, push=config.push_speed)
+        results = evaluate(self.graph(), config.evaluate_envs, config.evaluate_seconds, push=config.push_speed)
+        mean = lambda name: sum(getattr(r, name) for r in results.values()) / len(results)  # noqa: E731
         return {
-            "success": result.success.value,
-            "accuracy": result.accuracy,
-            "body_error": result.body_error,
-            "ball_error": result.ball_error,
-            "contact_error": result.contact_error,
+            "success": sum(r.success.value for r in results.values()) / len(results),
+            **{name: mean(name) for name in ("accuracy", "body_error", "ball_error", "contact_error")},
+            **{f"success_{skill}": r.success.value for skill, r in results.items()},
         }
 
     def graph(self) -> PolicyGraph:  # type: ignore[override]
         """The policy graph with the actor as it is now."""
-        graph = PolicyGraph(self.config)
+        graph = self.env.graph
         graph.actor = self.ppo.actor.mlp
         return graph.eval()
 
@@ -178,7 +177,10 @@ def main(argv: list[str]) -> int:
     def report(row: dict[str, float]) -> None:
         line = f"{row['samples'] / 1e6:7.3f} M  reward {row['reward']:.3f}  failed {row['fell']:.0f}"
         if "success" in row:
-            line += f"  success {row['success']:.0%}  accuracy {row['accuracy']:.0%}  ball {row['ball_error']:.3f} m"
+            each = ", ".join(
+                f"{k.removeprefix('success_')} {v:.0%}" for k, v in row.items() if k.startswith("success_")
+            )
+            line += f"  success {row['success']:.0%} ({each})  accuracy {row['accuracy']:.0%}"
         print(line, flush=True)
 
     training.run(report)

@@ -1,0 +1,135 @@
+"""Stepping by formula: what the legs do when a robot is told to walk, or has to step so as not to fall.
+
+A clock runs through one stride while steps are needed and rests with both feet on the ground. Each foot's place is that
+of a symmetric gait at the commanded velocity, moved by how much faster the robot is than commanded (Raibert, "Legged
+Robots That Balance", 1986); the clock starts by itself once the capture point (Pratt et al., 2006) leaves the feet. It
+only proposes: the actor's residual is what keeps the robot up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class Stride:
+    """Of the gait; angles are those of the line from ankle to hip, which bends about the hip."""
+
+    period: float = 0.76  # s, both feet
+    leg: float = 0.6  # m, hip to ankle
+    lift: float = 0.22  # rad of thigh and shin, at the top of a step: 3 cm
+    sway: float = 0.1  # rad, of the pelvis towards the standing foot
+    pendulum: float = 3.6  # 1/s, sqrt(g / height of the centre of mass)
+    placement: float = 0.05  # of v / pendulum: how far beyond its place a foot is put, forwards ...
+    placement_aside: float = 0.9  # ... and sideways
+    reach: float = 0.5  # rad, the furthest of either
+    ahead: float = 0.10  # rad of the capture point beyond which a step is needed: forwards,
+    behind: float = 0.12  # backwards,
+    aside: float = 0.16  # and sideways
+    calm: float = 0.5  # share of these below which the clock may rest
+    acceleration: float = 1.2  # m/s^2 (rad/s^2) of a command
+    idle: float = 0.05  # m/s (rad/s): a smaller command is none
+
+
+class Lean(NamedTuple):
+    """How the base stands over its standing feet, each (N, 1): rad, and rad/s times the leg's length in m/s."""
+
+    forward: Tensor
+    left: Tensor
+    forward_speed: Tensor
+    left_speed: Tensor
+
+
+class Gait(nn.Module):
+    """The formulas for robots whose leg joints carry the usual names; part of the exported graph."""
+
+    def __init__(self, joint_names: Sequence[str], period: float, stride: Stride) -> None:
+        """``period`` s of the policy."""
+        super().__init__()
+        self.stride, self.step = stride, period / stride.period
+        self.period = period
+        for side in ("left", "right"):
+            for what, parts in {
+                "line": {"hip_pitch": 1.0, "knee": 0.5},  # thigh and shin are equally long
+                "roll": {"hip_roll": 1.0},
+                "raise": {"hip_pitch": -1.0, "knee": 2.0, "ankle_pitch": -1.0},
+                "forward": {"hip_pitch": -1.0, "ankle_pitch": 1.0},  # the sole stays level
+                "aside": {"hip_roll": 1.0, "ankle_roll": -1.0},
+                "turn": {"hip_yaw": 1.0},
+            }.items():
+                row = [next((v for k, v in parts.items() if name == f"{side}_{k}_joint"), 0.0) for name in joint_names]
+                self.register_buffer(f"{side}_{what}", torch.tensor(row))
+
+    def ramp(self, last: Tensor, command: Tensor) -> Tensor:
+        """The command (N, 3) that is followed now: ``command``, approached at ``stride.acceleration``."""
+        most = self.stride.acceleration * self.period
+        return last + torch.clamp(command - last, -most, most)
+
+    def lean(self, phase: Tensor, gravity: Tensor, gyro: Tensor, bend: Tensor, joint_vel: Tensor) -> Lean:
+        """From the legs that stand: left, right or, at rest, both. ``gravity`` (N, 3) and ``gyro`` (N, 3) rad/s in the
+        base, ``bend`` (N, n) rad of the joints from the pose that is stood in."""
+        left = torch.where(
+            self.resting(phase), 0.5, (phase > 0.5).to(phase.dtype)
+        )  # share of it that the left leg bears
+
+        def of(x: Tensor, what: str) -> Tensor:
+            parts = [(x @ getattr(self, f"{side}_{what}"))[:, None] for side in ("left", "right")]
+            return left * parts[0] + (1 - left) * parts[1]
+
+        leg = self.stride.leg
+        return Lean(
+            gravity[:, 0:1] + of(bend, "line"),
+            gravity[:, 1:2] - of(bend, "roll"),
+            leg * (gyro[:, 1:2] + of(joint_vel, "line")),
+            -leg * (gyro[:, 0:1] + of(joint_vel, "roll")),
+        )
+
+    @staticmethod
+    def resting(phase: Tensor) -> Tensor:
+        """Whether both feet are on the ground to stay (N, 1) bool."""
+        return (phase == 0.0) | (phase == 0.5)
+
+    def advance(self, phase: Tensor, command: Tensor, lean: Lean) -> Tensor:
+        """This tick's phase (N, 1) in [0, 1): the left foot is in the air before 0.5, the right one after it, and at
+        exactly 0 and 0.5 both feet rest. ``command`` (N, 3): forward m/s, left m/s, turn rad/s."""
+        s = self.stride
+        resting = self.resting(phase)
+        limit = torch.where(resting, 1.0, s.calm)
+        capture = lean.forward + lean.forward_speed / (s.pendulum * s.leg)
+        capture_left = lean.left + lean.left_speed / (s.pendulum * s.leg)
+        fast = lean.forward_speed.abs() > 0.25 * (2 - limit)  # a step in mid-flight ends only when slow
+        falling = (capture > s.ahead * limit) | (capture < -s.behind * limit) | (capture_left.abs() > s.aside * limit)
+        need = (command.abs().amax(-1, keepdim=True) > s.idle) | falling | (fast & ~resting)
+        unloaded = torch.where(lean.left_speed > 0, 0.5, 0.0)  # pushed to the left: the right foot is light
+        moved = torch.where(resting, unloaded, phase) + self.step
+        crossed = torch.floor(2 * moved) > torch.floor(2 * torch.where(resting, unloaded, phase) + 1e-6)
+        landed = torch.where(crossed & ~need, torch.floor(2 * moved) / 2, moved)
+        following = landed - torch.floor(landed)
+        return torch.where(resting & ~need, phase, following)
+
+    def offsets(self, phase: Tensor, command: Tensor, lean: Lean) -> Tensor:
+        """What steps add to the reference pose (N, n) rad."""
+        s = self.stride
+        angle = 2 * torch.pi * phase
+        sin, cos = torch.sin(angle), torch.cos(angle)
+        walking = (~self.resting(phase)).to(phase.dtype)
+        swept = command * (walking * s.period / 4)
+        error, error_left = lean.forward_speed - command[:, 0:1], lean.left_speed - command[:, 1:2]
+        further = torch.clamp(s.placement * error / (s.pendulum * s.leg), -s.reach, s.reach) * walking
+        further_left = torch.clamp(s.placement_aside * error_left / (s.pendulum * s.leg), -s.reach, s.reach) * walking
+        total = (s.sway * walking * sin) * (self.left_aside + self.right_aside)
+        for sign, lifted, placed, side in (
+            (-1.0, torch.relu(sin) ** 2, (1 - cos) / 2, "left"),
+            (1.0, torch.relu(-sin) ** 2, (1 + cos) / 2, "right"),
+        ):
+            part = lambda what, side=side: getattr(self, f"{side}_{what}")  # noqa: E731
+            total = total + s.lift * lifted * part("raise")
+            total = total + (sign * cos * swept[:, 0:1] / s.leg + placed * further) * part("forward")
+            total = total + (sign * cos * swept[:, 1:2] / s.leg + placed * further_left) * part("aside")
+            total = total + (sign * cos * swept[:, 2:3]) * part("turn")
+        return total
