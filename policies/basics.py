@@ -50,7 +50,7 @@ class Basics:
 
     robot: str = "g1"
     seed: int = 1
-    envs: int = 256
+    envs: int = 512
     threads: int = 2  # of the physics; the networks have one more
     # the policy
     period: float = 0.02  # s
@@ -85,7 +85,7 @@ class Basics:
     command_low: tuple[float, float, float] = (-0.4, -0.3, -0.8)  # m/s, m/s, rad/s
     command_high: tuple[float, float, float] = (0.8, 0.3, 0.8)
     command_zero: float = 0.15  # share of commands that are none
-    easy: float = 0.3  # at curriculum level 0, all of this is so much of what it is at level 1
+    easy: float = 0.5  # at curriculum level 0, all of this is so much of what it is at level 1
     home_start: float = 0.2  # share of episodes that start at home instead of inside a motion
     # the learner
     horizon: int = 24  # ticks per iteration

@@ -86,7 +86,7 @@ class FileActor:
         if not error < 1e-3:
             raise Sim2realError(
                 f"{self.path}: its targets are up to {error:.2g} rad off those of policies/basics.py for the same actions,"
-                " expected the same; it was made with other settings: export it again (sim2real train --export)"
+                " expected the same; it was made with other settings: export it again (sim2real export)"
             )
         return result
 

@@ -25,7 +25,7 @@ class Stride:
     lift: float = 0.22  # rad of thigh and shin, at the top of a step: 3 cm
     sway: float = 0.1  # rad, of the pelvis towards the standing foot
     pendulum: float = 3.6  # 1/s, sqrt(g / height of the centre of mass)
-    placement: float = 0.05  # of v / pendulum: how far beyond its place a foot is put, forwards ...
+    placement: float = 0.5  # of v / pendulum: how far beyond its place a foot is put, forwards ...
     placement_aside: float = 0.9  # ... and sideways
     reach: float = 0.5  # rad, the furthest of either
     ahead: float = 0.10  # rad of the capture point beyond which a step is needed: forwards,

@@ -32,7 +32,7 @@ def test_a_run_writes_its_settings_its_curve_and_its_best_policy(tmp_path):
     training.run()
     rows = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
     assert [r["samples"] for r in rows] == [32, 64]
-    assert {"reward", "reward_contact", "reward_body", "success", "ball_error"} <= set(rows[-1])
+    assert {"reward", "reward_contact", "reward_body", "score", "success_hold", "ball_error"} <= set(rows[-1])
     assert load_config(tmp_path) == TINY
     torch.testing.assert_close(load_graph(tmp_path).actor.state_dict(), training.graph().actor.state_dict())
 
@@ -45,7 +45,7 @@ def test_a_run_writes_its_settings_its_curve_and_its_best_policy(tmp_path):
 
 def test_a_run_of_another_version_is_named(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps({"config": {"robot": "g1", "magic": 1}}))
-    with pytest.raises(Sim2realError, match=r"config.json: unknown settings magic"):
+    with pytest.raises(Sim2realError, match=r"config.json: its settings are of another version .*magic"):
         load_config(tmp_path)
     with pytest.raises(Sim2realError, match="no such checkpoint"):
         load_graph(tmp_path)
