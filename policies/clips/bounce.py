@@ -23,6 +23,7 @@ from policies.physics import standing_height
 
 GRAVITY = 9.81  # m/s^2
 SOLVER = "daqp"
+CLEAR = 0.015  # m between palm and ball while they do not touch
 SMOOTHING = 0.8  # frames
 SETTLING = 3  # strokes before the one that is kept: then inverse kinematics has forgotten where it began
 
@@ -31,11 +32,11 @@ SETTLING = 3  # strokes before the one that is kept: then inverse kinematics has
 class Stroke:
     """One bounce, at the size of the robot."""
 
-    peak: float = 0.76  # m, the ball's centre where the palm finds it
+    peak: float = 0.77  # m, the ball's centre where the palm finds it
     push: float = 0.18  # m that the palm stays on it
     follow: float = 0.05  # m that the palm goes on after it
-    place: tuple[float, float] = (0.15, 0.31)  # m from the base: ahead, and to the side of the arm
-    knees: float = 1.0  # rad, bent: brings the hand down
+    place: tuple[float, float] = (0.2, 0.31)  # m from the base: ahead, and to the side of the arm
+    knees: float = 0.9  # rad, bent: brings the hand down
 
 
 class Times(NamedTuple):
@@ -83,7 +84,10 @@ def path(stroke: Stroke, radius: float, t: np.ndarray) -> tuple[np.ndarray, np.n
     fly = k.fall + k.rise
     u = f / fly  # Hermite: from the release, at its speed, to rest at the peak
     back = leave + stroke.push * (3 * u**2 - 2 * u**3) - k.release * fly * (u**3 - 2 * u**2 + u)
-    return z, v, np.where(on, z, np.maximum(back, leave - stroke.follow)), on
+    above = np.maximum.reduce(
+        [back, np.full_like(back, leave - stroke.follow), z + np.minimum(CLEAR, GRAVITY * left**2 / 4)]
+    )
+    return z, v, np.where(on, z, above), on
 
 
 def dribble(body: RobotBody, name: str, stroke: Stroke = Stroke(), side: str = "right", fps: float = 50.0) -> Clip:
