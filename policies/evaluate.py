@@ -50,6 +50,7 @@ class Episodes(NamedTuple):
 
     survived: np.ndarray  # (episodes,) bool
     error: np.ndarray  # (episodes,) rad, mean distance of the joints from their reference
+    life: np.ndarray  # (episodes,) ticks until it fell
     velocity: (
         np.ndarray
     )  # (episodes, 2) m/s, mean of the base over the ground, forwards and to the left, while it is up
@@ -122,7 +123,7 @@ def run_episodes(
             moved += env.tick.velocity * survived[:, None]
             ticks += survived[:, None]
             errors[t] = np.abs(env.tick.joint_pos - env.tick.reference).mean(axis=-1)
-    return Episodes(survived, errors.mean(axis=0), moved / np.maximum(ticks, 1))
+    return Episodes(survived, errors.mean(axis=0), ticks[:, 0], moved / np.maximum(ticks, 1))
 
 
 def skill_script(config: Basics, labels: int, episodes: int, seconds: float) -> np.ndarray:

@@ -22,11 +22,12 @@ class Stride:
 
     period: float = 0.76  # s, both feet
     leg: float = 0.6  # m, hip to ankle
-    lift: float = 0.22  # rad of thigh and shin, at the top of a step: 3 cm
-    sway: float = 0.1  # rad, of the pelvis towards the standing foot
+    lift: float = 0.2  # rad of thigh and shin, at the top of a step: 3 cm
+    sway: float = 0.07  # rad, of the pelvis towards the standing foot
     pendulum: float = 3.6  # 1/s, sqrt(g / height of the centre of mass)
     placement: float = 0.5  # of v / pendulum: how far beyond its place a foot is put, forwards ...
     placement_aside: float = 0.9  # ... and sideways
+    upright: float = 0.8  # rad of a standing leg's hip per rad that the trunk is pitched or rolled
     reach: float = 0.5  # rad, the furthest of either
     ahead: float = 0.10  # rad of the capture point beyond which a step is needed: forwards,
     behind: float = 0.12  # backwards,
@@ -37,10 +38,13 @@ class Stride:
 
 
 class Lean(NamedTuple):
-    """How the base stands over its standing feet, each (N, 1): rad, and rad/s times the leg's length in m/s."""
+    """How the base stands over its standing feet, each (N, 1): rad, and rad/s times the leg's length in m/s; and how the
+    trunk is turned, rad."""
 
     forward: Tensor
     left: Tensor
+    pitch: Tensor
+    roll: Tensor
     forward_speed: Tensor
     left_speed: Tensor
 
@@ -61,6 +65,7 @@ class Gait(nn.Module):
                 "forward": {"hip_pitch": -1.0, "ankle_pitch": 1.0},  # the sole stays level
                 "aside": {"hip_roll": 1.0, "ankle_roll": -1.0},
                 "turn": {"hip_yaw": 1.0},
+                "pitch": {"hip_pitch": 1.0},
             }.items():
                 row = [next((v for k, v in parts.items() if name == f"{side}_{k}_joint"), 0.0) for name in joint_names]
                 self.register_buffer(f"{side}_{what}", torch.tensor(row))
@@ -85,6 +90,8 @@ class Gait(nn.Module):
         return Lean(
             gravity[:, 0:1] + of(bend, "line"),
             gravity[:, 1:2] - of(bend, "roll"),
+            gravity[:, 0:1],
+            -gravity[:, 1:2],
             leg * (gyro[:, 1:2] + of(joint_vel, "line")),
             -leg * (gyro[:, 0:1] + of(joint_vel, "roll")),
         )
@@ -132,4 +139,7 @@ class Gait(nn.Module):
             total = total + (sign * cos * swept[:, 0:1] / s.leg + placed * further) * part("forward")
             total = total + (sign * cos * swept[:, 1:2] / s.leg + placed * further_left) * part("aside")
             total = total + (sign * cos * swept[:, 2:3]) * part("turn")
+            # A standing leg turns the trunk back; the other is put where it would be under a level trunk.
+            turned = torch.where(lifted > 0, -1.0, s.upright) * walking
+            total = total + turned * lean.pitch * part("pitch") + turned * lean.roll * part("roll")
         return total

@@ -15,7 +15,7 @@ from sim2real.config import load_robot
 ROBOT = load_robot("g1")
 STRIDE = Stride()
 GAIT = Gait(ROBOT.joint_names, 0.02, STRIDE)
-STILL = Lean(*torch.zeros(4, 1, 1))
+STILL = Lean(*torch.zeros(6, 1, 1))
 NONE = torch.zeros(1, 3)
 FORWARD = torch.tensor([[0.5, 0.0, 0.0]])
 
@@ -101,7 +101,8 @@ def test_the_swinging_foot_is_lifted_and_the_other_is_not():
 
 def test_a_standing_foot_goes_back_as_fast_as_the_robot_goes_forward():
     """Over the middle half of the stance; a harmonic is faster there than on average by pi / 2 and slower at its ends."""
-    a, b = foot("right", offsets(0.01, FORWARD)), foot("right", offsets(0.49, FORWARD))
+    on_time = STILL._replace(forward_speed=torch.tensor([[0.5]]))
+    a, b = (foot("right", offsets(phase, FORWARD, on_time)) for phase in (0.01, 0.49))
     assert (a - b)[0] / (0.48 * STRIDE.period) == pytest.approx(0.5, rel=0.1)
 
 
@@ -109,6 +110,14 @@ def test_a_robot_faster_than_told_puts_its_foot_further():
     fast = STILL._replace(forward_speed=torch.tensor([[0.8]]), left_speed=torch.tensor([[0.5]]))
     further = foot("left", offsets(0.49, lean=fast)) - foot("left", offsets(0.49))
     assert further[0] > 0.005 and further[1] > 0.03
+
+
+def test_a_standing_leg_turns_the_trunk_back_and_a_swinging_one_stays_below_it():
+    pitched = STILL._replace(pitch=torch.tensor([[0.2]]))
+    change = (offsets(0.25, lean=pitched) - offsets(0.25))[0]
+    hip = {side: change[ROBOT.joint_names.index(f"{side}_hip_pitch_joint")].item() for side in ("left", "right")}
+    assert hip["left"] == pytest.approx(-0.2)  # in the air
+    assert hip["right"] == pytest.approx(0.2 * STRIDE.upright)
 
 
 def test_the_lean_is_that_of_the_legs_that_stand():
@@ -126,8 +135,8 @@ def test_the_lean_is_that_of_the_legs_that_stand():
 def test_the_mirror_image_of_a_step_is_the_other_step():
     index, sign = joint_mirror(ROBOT.joint_names)
     command = torch.tensor([[0.4, 0.2, 0.3]])
-    lean = Lean(*(torch.tensor([[v]]) for v in (0.1, 0.05, 0.6, 0.3)))
-    turned = Lean(lean.forward, -lean.left, lean.forward_speed, -lean.left_speed)
+    lean = Lean(*(torch.tensor([[v]]) for v in (0.1, 0.05, 0.2, 0.1, 0.6, 0.3)))
+    turned = Lean(lean.forward, -lean.left, lean.pitch, -lean.roll, lean.forward_speed, -lean.left_speed)
     one = offsets(0.2, command, lean)
     other = offsets(0.7, command * torch.tensor([1.0, -1.0, -1.0]), turned)
     torch.testing.assert_close(one[:, index] * torch.tensor(sign), other, atol=1e-6, rtol=0)
