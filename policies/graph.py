@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from policies.basics import MOTIONS, Basics
-from policies.gait import Gait
+from policies.gait import Gait, single_loads
 from policies.observations import Signals, gravity_in_base, observe
 from policies.references import References
 from sim2real.config import RobotConfig, load_robot
@@ -58,7 +59,10 @@ class PolicyGraph(nn.Module):
         ankles = torch.tensor([float("ankle_pitch" in name) for name in robot.joint_names])
         self.register_buffer("ankles", ankles)
         self.register_buffer("walks", torch.tensor([[float(m.walks)] for m in MOTIONS.values()]))
-        self.gait = Gait(robot.joint_names, config.period, config.stride)
+        body = mujoco.MjModel.from_xml_path(str(robot.model_path))
+        loads = single_loads(body, robot.home_pos, self.kp) * np.array([groups[n] == "leg" for n in groups])
+        loads -= config.balance_offset * ankles.numpy() * (loads != 0)  # which the ankles are told of anyway
+        self.gait = Gait(robot.joint_names, config.period, config.stride, loads)
         self.register_buffer("value_healthy", torch.ones(len(self.labels)))
         self.actor: nn.Module = nn.Identity()
         self.critic: nn.Module = nn.Identity()

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from policies.basics import Basics
-from policies.gait import Gait, Lean, Stride
+from policies.gait import Gait, Lean, Stride, single_loads
 from policies.mirror import joint_mirror
 from sim2real.config import load_robot
 
@@ -34,7 +34,7 @@ def test_without_a_reason_both_feet_rest(phase):
 
 def test_a_command_starts_the_clock_and_it_goes_round():
     phases = clock(0.0, 50, FORWARD)
-    assert 0 < phases[0] < 0.03
+    assert phases[0] == pytest.approx(0.02 / STRIDE.period)
     assert any(b < a for a, b in zip(phases, phases[1:], strict=False))
     assert all(0.0 <= p < 1.0 for p in phases)
 
@@ -140,6 +140,18 @@ def test_the_mirror_image_of_a_step_is_the_other_step():
     one = offsets(0.2, command, lean)
     other = offsets(0.7, command * torch.tensor([1.0, -1.0, -1.0]), turned)
     torch.testing.assert_close(one[:, index] * torch.tensor(sign), other, atol=1e-6, rtol=0)
+
+
+def test_a_loaded_leg_is_told_of_the_torque_that_holds_the_body_up():
+    """Hip roll: the weight on an arm from the foot's line to the centre of mass up to the hip, about 0.11 m."""
+    model = mujoco.MjModel.from_xml_path(str(ROBOT.model_path))
+    loads = single_loads(model, ROBOT.home_pos, ROBOT.home_kp)
+    roll = ROBOT.joint_names.index("left_hip_roll_joint")
+    weight = float(model.body_subtreemass[1]) * 9.81
+    assert loads[0, roll] * ROBOT.home_kp[roll] == pytest.approx(0.11 * weight, rel=0.1)
+    index, sign = joint_mirror(ROBOT.joint_names)
+    np.testing.assert_allclose(loads[0, index] * sign, loads[1], atol=0.01)
+    assert all(loads[0, k] == 0.0 for k, name in enumerate(ROBOT.joint_names) if name.startswith("right"))
 
 
 def test_its_settings_are_part_of_a_run_s():
