@@ -203,8 +203,9 @@ class RecoilCodec:
     """The host's side of one bus (a ``can_bus.CanCodec``). It remembers which gains each device has, and what it was asked."""
 
     # Bits of RPDO2 and TPDO2 and, every third tick, of an SDO question (3 bytes) and its answer (4 bytes): means of random
-    # targets and states. For the whole bus, one gain a tick.
-    TICK_BITS = (120.5 + 115.1 + (77.0 + 84.0) / 3, 135.0 + 135.0 + (85.0 + 95.0) / 3)
+    # targets and states. For the whole bus, one gain a tick; worst, while gains move (soft start, scaled torque), both
+    # gains of every motor in each.
+    TICK_BITS = (120.5 + 115.1 + (77.0 + 84.0) / 3, 135.0 + 135.0 + (85.0 + 95.0) / 3 + 2 * 135.0)
     TICK_OVERHEAD_BITS = 120.0
     MOTOR_FRAMES = 2 + 2 / 3
 
