@@ -414,6 +414,10 @@ class RecoilMotors:
         """A TPDO2 or TPDO4 (rad, rad/s), or TPDO3 (rad, N m), FRAME (1,)."""
         return _frame(identifier(function, int(self.ids[row])), np.array([position, second], "<f4").tobytes())
 
+    def pack_motions(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """The TPDO2 (FRAME, (n,)) of every motor: rad, rad/s."""
+        return make_frames(identifier(Function.TPDO2, 0) | self.ids, _bytes(position, velocity))
+
     def pack_echo(self, row: int, data: np.ndarray) -> np.ndarray:
         """A TPDO1 (FRAME, (1,)): the eight bytes of the RPDO1."""
         return _frame(identifier(Function.TPDO1, int(self.ids[row])), data.tobytes())
