@@ -46,7 +46,8 @@ def test_joint_positions_are_the_bodys_own(connected, robot):
     exchange(world, body, state)
     error = np.abs(state.joint_pos - of_plant(world, robot, world.plant.joint_pos))
     period = 1 / robot.wiring().rate
-    moved = np.abs(of_plant(world, robot, world.plant.joint_vel)) * (period + 0.002)  # limp limbs: since it was measured
+    speed = np.abs(of_plant(world, robot, world.plant.joint_vel))  # limbs hang limp
+    moved = speed * (period + 0.002)  # since it was measured
     assert (error <= moved + 2 * np.pi / 4096).all()  # and one step of the coarsest wire
     assert (state.joint_age < period).all() and (state.joint_enabled == 0).all() and (state.joint_error == 0).all()
 
