@@ -46,6 +46,7 @@ class JointConfig(Strict):
     kp_max: Positive  # N m/rad
     kd_max: Positive  # N m s/rad
     damping: Positive  # N m s/rad: kd while damping
+    thermometer: bool = True  # its motor reports a temperature; false: a motor that says nothing passes as cold
     group: Literal["leg", "waist", "arm", "hand", "head"]
     source: str  # where the numbers come from, with the hardware variant
 
@@ -239,6 +240,10 @@ class RobotConfig(Strict):
     @cached_property
     def damping(self) -> np.ndarray:
         return np.array([j.damping for j in self.joints])
+
+    @cached_property
+    def thermometer(self) -> np.ndarray:
+        return np.array([j.thermometer for j in self.joints])
 
     @cached_property
     def home_pos(self) -> np.ndarray:

@@ -110,7 +110,7 @@ class Launch:
     faults: Sequence[str] = ()
     recorder: Any = None  # a started sim2real.recorder.process.Recorder
     show: Callable[[Launch], None] = lambda launch: None
-    gantry: bool = True
+    hang: bool = False  # nobody sets the simulated robot down from its gantry
     messages: list[str] = field(default_factory=list)
     timeout: float = 10.0  # s to be armed and through the soft start, counted from the wish to arm
 
@@ -193,7 +193,7 @@ class Launch:
         running: float | None = None
         asked: float | None = None
         guardian = self.children["guardian"].process
-        hanging = self.gantry
+        hanging = not self.hang
         n = 0
         while guardian.poll() is None:
             schedule.wait()

@@ -141,7 +141,7 @@ class Plant:
         self.data.xfrc_applied[:] = 0.0
         self.gantry.release()
         mujoco.mj_forward(self.model, self.data)
-        self._stood = float(self.data.xpos[self._base][2]) - (hang or 0.0)
+        self._stood = float(self.data.subtree_com[self._root][2]) - (hang or 0.0)
         if hang is not None and self.floating:
             com = self.data.subtree_com[self._root] + np.array([0.0, 0.0, 0.3])
             frame = self.data.xmat[self._hook_body].reshape(3, 3)
@@ -217,8 +217,10 @@ class Plant:
 
     @property
     def fallen(self) -> bool:
-        """The base is below half the height at which it stood at reset, or leans by more than 1 rad."""
-        return bool(self.floating and (self.data.xpos[self._base, 2] < 0.5 * self._stood or self.tilt > 1.0))
+        """The centre of mass is below half the height at which it stood at reset, or the base leans by more than 1 rad.
+
+        Not the base's height: some makers put its frame on the floor."""
+        return bool(self.floating and (self.data.subtree_com[self._root, 2] < 0.5 * self._stood or self.tilt > 1.0))
 
     def truth(self) -> Truth:
         velocity = np.zeros(6)

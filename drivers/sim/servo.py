@@ -359,6 +359,11 @@ class SimServos:
         shaft = (self._sign * self._body.joint_pos + self._offset) / TICK + ZERO
         return shaft + self._turns + self._column("HOMING_OFFSET")
 
+    @property
+    def enabled(self) -> np.ndarray:
+        """(n,) bool: torque is on."""
+        return (self._table[:, RAM] > 0) & np.array(self.powered)
+
     # -- time --------------------------------------------------------------------------------------------------------
 
     def act(self, start: float, end: float) -> None:
@@ -384,7 +389,7 @@ class SimServos:
 
     def _decide(self) -> np.ndarray:
         """The law (3, n) that goals and modes make: bias, kp, kd at the joints."""
-        on = (self._table[:, RAM] > 0) * np.array(self.powered)
+        on = self.enabled
         mode = self._column("OPERATING_MODE")
         by_position = np.isin(mode, (POSITION_MODE, EXTENDED_MODE, CURRENT_POSITION_MODE))
         kp = np.where(by_position, self._column("POSITION_P_GAIN") / self._gain, 0.0)
