@@ -20,6 +20,7 @@ class BusProtocol(NamedTuple):
     codec: str
     motors: str = ""
     watchdog: bool = True  # connecting programs one
+    calibrated: bool = False  # the maker did it: positions are those of the joints
 
 
 def _can(name: str, codec: str, watchdog: bool = True) -> BusProtocol:
@@ -37,8 +38,12 @@ PROTOCOLS: dict[str, BusProtocol] = {
     "robstride_mit": _can("robstride_mit", "RobstrideMit", watchdog=False),
     "odrive": _can("odrive", "Odrive", watchdog=False),
     "dynamixel": BusProtocol("serial", "drivers.serial_bus:SerialBus", "drivers.codecs.dynamixel:DynamixelCodec"),
-    "feetech": BusProtocol("serial", "drivers.serial_bus:SerialBus", "drivers.codecs.feetech:FeetechCodec"),
-    "unitree_hg": BusProtocol("dds", "drivers.dds_bus:DdsBus", "drivers.codecs.unitree_hg:UnitreeHgCodec"),
+    "feetech": BusProtocol(
+        "serial", "drivers.serial_bus:SerialBus", "drivers.codecs.feetech:FeetechCodec", watchdog=False
+    ),
+    "unitree_hg": BusProtocol(
+        "dds", "drivers.dds_bus:DdsBus", "drivers.codecs.unitree_hg:UnitreeHgCodec", watchdog=False, calibrated=True
+    ),
 }
 
 WORLDS: dict[str, str] = {
@@ -72,7 +77,7 @@ def open_codec(spec: BusSpec) -> Any:
             "  With 0 the wiring says that these motors may go on without the host; set their own time-out with the "
             "maker's tool"
         )
-    if not spec.watchdog and protocol.watchdog and protocol.wire != "dds":
+    if not spec.watchdog and protocol.watchdog:
         raise BusError(
             f"bus {spec.name}: got watchdog 0, expected more: '{spec.protocol}' has one, and it must be used"
         )

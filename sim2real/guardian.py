@@ -16,13 +16,15 @@ import numpy as np
 from drivers.budget import budget
 from drivers.bus import BusError
 from drivers.wire import WireError
+from sim2real.calibration import load_calibration
 from sim2real.channel import Channel
 from sim2real.clock import MonotonicClock, SimClock
+from sim2real.preflight import Preflight
 from sim2real.records import Calls, Layout, command_fields, command_view, layout, state_view, tick_layout
 from sim2real.robot import Robot, open_robot
 from sim2real.run import Life, RunSpec, channel, keep_time, sink, tell
 from sim2real.safety import Limits, Safety
-from sim2real.types import JointCommand, Mode
+from sim2real.types import JointCommand, Mode, Sim2realError
 
 TICK, PILOT = 0, 1  # topics of a record
 
@@ -259,8 +261,12 @@ def main(directory: Path) -> int:
     clock = MonotonicClock()
     try:
         robot = open_robot(config, wiring, simulated_in=str(directory) if spec.simulated else None)
-        robot.connect(clock)
-    except (BusError, WireError) as error:
+        if spec.simulated:
+            robot.connect(clock)
+        else:
+            calibration = load_calibration(spec.calibration) if spec.calibration else None
+            Preflight(config, spec.wiring, wiring, robot, clock, calibration, spec.variants, tell).run()
+    except (BusError, WireError, Sim2realError) as error:
         tell(str(error), failed=True)
         return 2
     guardian = Guardian(

@@ -200,6 +200,8 @@ class DamiaoCodec:
     # Bits of one command and its answer on the wire, inter-frame space included: the mean of MIT traffic, and the most
     # that bit stuffing makes of twice 8 bytes with an 11-bit identifier.
     TICK_BITS = (117.6 + 115.0, 135.0 + 135.0)
+    IDENTITY = ("SN",)
+    TURN = 2 * np.pi  # single-turn absolute encoder at the output
 
     def __init__(self, spec: BusSpec) -> None:
         """Raises BusError for an unknown model, or identifiers by which the motors could not be told apart."""

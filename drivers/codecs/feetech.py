@@ -179,6 +179,8 @@ class FeetechCodec:
     _ANSWER = 6 + STATE.itemsize  # bytes
     TICK_BITS = (10.0 * (GOAL.itemsize + 1 + _ANSWER),) * 2
     TICK_OVERHEAD_BITS = 10.0 * 2 * 8
+    IDENTITY = ("MODEL",)  # there is no serial number
+    TURN = 2 * np.pi
     ERROR_REGISTER = ""  # errors last as long as their cause
     HAS_FAST_READ = False
 

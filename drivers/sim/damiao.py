@@ -23,6 +23,7 @@ from drivers.sim.wire import priority
 from drivers.wire import FRAME, make_frames
 
 MAGIC_PREFIX = b"\xff" * 7
+FIRST_SERIAL = 1001
 
 
 class SimDamiao(SimMotors):
@@ -159,6 +160,7 @@ def _factory_registers(spec, ranges: Ranges, row: int) -> dict[str, float | int]
         "CTRL_MODE": damiao.MIT_MODE,
         "TIMEOUT": 0,
         "CAN_BR": 4,
+        "SN": FIRST_SERIAL + row,
         "OT_VALUE": ROTOR_LIMIT,
         "PMAX": float(ranges.position[row]),
         "VMAX": float(ranges.velocity[row]),

@@ -25,6 +25,7 @@ from drivers.sim.wire import priority
 from drivers.wire import FRAME
 
 BUS_VOLTAGE = 48.0
+FIRST_UID = 0x5253_0000_0000_0001
 OVER_TEMPERATURE = 1 << 2  # bit of a feedback identifier
 FAULT_CLEAR = 1  # byte 0 of STOP
 
@@ -43,8 +44,9 @@ class SimRobstride(SimMotors):
     def factory(self) -> list[dict[str, float]]:
         torque = self._codec.scales.torque
         return [
-            dict.fromkeys(robstride.PARAMETERS, 0.0) | {"limit_torque": t, "zero_sta": 1.0, "EPScan_time": 1.0}
-            for t in torque.tolist()
+            dict.fromkeys(robstride.PARAMETERS, 0.0)
+            | {"limit_torque": t, "zero_sta": 1.0, "EPScan_time": 1.0, robstride.UID: FIRST_UID + row}
+            for row, t in enumerate(torque.tolist())
         ]
 
     def addressee(self, bus: int, id: int, raw: bytes) -> int:
@@ -62,6 +64,8 @@ class SimRobstride(SimMotors):
                 self._arrived.append((row, raw, time))
             return answer
         self._take_commands()  # what came before counts before
+        if kind == Type.GET_ID:
+            return self._say(row, self._codec.pack_uid(row, int(self._registers[row][robstride.UID])))
         if kind == Type.READ:
             return self._read(row, frame["data"][0])
         if kind not in (Type.ENABLE, Type.STOP, Type.SET_ZERO, Type.WRITE, Type.SAVE):
