@@ -1,0 +1,93 @@
+"""A simulated person who calibrates a simulated robot: hands on its joints, eyes on its body, no idea of its motors.
+
+One hand moves a joint; the other holds the rest of the limb in the middle of its ranges, out of the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from drivers.bus import BusSpec
+
+SPEED = 1.5  # rad/s at which a joint is moved
+GRIP = 15.0  # rad/s, how firmly it is held: the natural frequency of joint and hand
+BEYOND = 0.1  # rad that the hand would go on behind the stop
+HOLD_TIME = 1.2  # s at each stop
+
+
+class Person:
+    """Moves the joints of ``world`` while it advances. ``ranges``: by joint, where its stops are (rad); ``limbs``: by
+    joint, of which limb it is."""
+
+    def __init__(
+        self, world: Any, ranges: Mapping[str, tuple[float, float]], limbs: Mapping[str, str], timestep: float = 0.002
+    ) -> None:
+        self._world, self._ranges, self._limbs, self._timestep = world, ranges, limbs, timestep
+        self._joint = ""
+        self._held: dict[str, float] = {}  # where the other hand has the rest of the limb
+        self._target = 0.0
+        self._goals: list[tuple[float, float]] = []  # (where to, how long to stay there)
+        self._stayed = 0.0
+
+    def move(self, joint: str) -> None:
+        """From now on: to its lower stop, then to its upper one, and stay there."""
+        self.let_go()
+        low, high = self._ranges[joint]
+        plant = self._world.plant
+        self._joint, self._target = joint, float(plant.joint_pos[plant.joints.index(joint)])
+        self._held = {
+            other: float(plant.joint_pos[plant.joints.index(other)])
+            for other, limb in self._limbs.items() if limb == self._limbs[joint] and other != joint
+        }  # fmt: skip
+        self._goals = [(low - BEYOND, HOLD_TIME), (high + BEYOND, np.inf)]
+
+    def let_go(self) -> None:
+        """Hands off."""
+        for joint in (self._joint, *self._held) if self._joint else ():
+            self._world.plant.pull(joint, 0.0)
+        self._joint, self._held, self._stayed = "", {}, 0.0
+
+    def advance(self, until: float) -> None:
+        """Let time pass in the world, and hands do what they do."""
+        while self._world.time < until - 1e-9:
+            if self._joint:
+                self._act(self._timestep)
+            self._world.advance(min(until, self._world.time + self._timestep))
+
+    def _act(self, dt: float) -> None:
+        goal, stay = self._goals[0]
+        step = self._grip(self._joint, self._target, goal, dt)
+        self._target += step
+        for joint, target in self._held.items():
+            self._held[joint] += self._grip(joint, target, sum(self._ranges[joint]) / 2, dt)
+        if not step:
+            self._stayed += dt
+            if self._stayed > stay:
+                del self._goals[0]
+                self._stayed = 0.0
+
+    def _grip(self, joint: str, target: float, goal: float, dt: float) -> float:
+        """Pull at a joint so that it follows ``target`` on its way to ``goal``; returns how far that goes on in ``dt``."""
+        step = float(np.clip(goal - target, -SPEED * dt, SPEED * dt))
+        plant = self._world.plant
+        i = plant.joints.index(joint)
+        weight, inertia = plant.weight_on(joint)
+        pull = GRIP**2 * (target + step - plant.joint_pos[i]) + 2 * GRIP * (step / dt - plant.joint_vel[i])
+        plant.pull(joint, weight + inertia * float(pull))
+        return step
+
+
+def assembled(specs: Sequence[BusSpec], seed: int) -> list[BusSpec]:
+    """The buses of a robot that somebody put together: motors either way round, their zeros anywhere within a fifth of a
+    turn."""
+    random = np.random.default_rng(seed)
+    return [
+        replace(spec, motors=tuple(
+            replace(m, sign=int(random.choice((-1, 1))), offset=float(random.uniform(-1.25, 1.25))) for m in spec.motors
+        ))
+        for spec in specs
+    ]  # fmt: skip
