@@ -47,6 +47,7 @@ class JointConfig(Strict):
     kd_max: Positive  # N m s/rad
     damping: Positive  # N m s/rad: kd while damping
     group: Literal["leg", "waist", "arm", "hand", "head"]
+    reach: Literal["both", "lower", "upper"] = "both"  # stops that a hand brings it to; the body blocks the other
     source: str  # where the numbers come from, with the hardware variant
 
     @model_validator(mode="after")

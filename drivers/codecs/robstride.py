@@ -122,6 +122,7 @@ PARAMETERS: dict[str, tuple[int, str]] = {
     "add_offset": (0x702B, "<f4"),
 }
 PARAMETER_NAMES = {index: name for name, (index, _) in PARAMETERS.items()}
+BIT_RATES = {1: 1_000_000, 2: 500_000, 3: 250_000, 4: 125_000}  # of BAUD
 UID = "MCU_UID"  # no parameter: the answer to GET_ID, 64 bits
 BROADCAST_ID = 0xFE  # to which GET_ID is answered
 SEQUENCE = bytes(range(1, 9))  # payload by which SAVE, BAUD, REPORT and PROTOCOL are meant

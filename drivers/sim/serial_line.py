@@ -88,6 +88,11 @@ class SerialLine:
             self._inbox.popleft()
         return out
 
+    def retune(self, bitrate: int) -> None:
+        """The host's port now runs at ``bitrate``."""
+        self._byte = BITS_PER_BYTE / bitrate
+        self.servos.retune(bitrate)
+
     def _host_fault(self, now: float) -> Fault | None:
         for fault in self._faults:
             if fault.kind in HOST and fault.start <= now < fault.end and self._random.random() < fault.probability:

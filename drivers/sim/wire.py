@@ -37,6 +37,10 @@ class Motors(Protocol):
 
     powered: list[bool]
 
+    def retune(self, bus: int, bitrate: int) -> None:
+        """The host of a bus now talks at ``bitrate``."""
+        ...
+
     def addressee(self, bus: int, id: int, raw: bytes) -> int:
         """Row of the motor that a frame of the host is for; -1: none."""
         ...
@@ -131,6 +135,11 @@ class SimCan:
         while inbox and inbox[0][0] <= now + TOLERANCE:
             raws.append(inbox.popleft()[1])
         return np.frombuffer(b"".join(raws), FRAME)
+
+    def retune(self, bitrate: int) -> None:
+        """The host's controller now runs at ``bitrate``."""
+        self._bit = 1.0 / bitrate
+        self._motors.retune(self.index, bitrate)
 
     # -- the wire ----------------------------------------------------------------------------------------------------
 

@@ -1,8 +1,8 @@
 """Where a joint's zero is on its motor, and which way it turns: found by moving it by hand from one stop to the other.
 
 Motors are off and only asked. The range of the joint is known from the YAML, that of the motor is measured; they lie on
-each other in two ways, and the end at which the joint was held last, which is to be its upper one, tells which. Then the
-robot hangs still, and two checks find what a hand did wrong: a limp joint at rest bears no more torque than its friction
+each other in two ways, and the end at which the joint was held last, which is to be its upper one, tells which. Where the
+body blocks one stop (``reach`` in the YAML), the other is enough, touched twice. Then the robot hangs still, and two checks find what a hand did wrong: a limp joint at rest bears no more torque than its friction
 holds, and left and right hang alike.
 """
 
@@ -26,6 +26,7 @@ SPAN_TOLERANCE = 0.1  # rad by which a range between stops may differ from the Y
 REST = 0.02  # rad that a joint which is held still may move
 HOLD_TIME = 0.8  # s for which it is held at its upper end
 NEAR = 0.05  # rad from an end that is at it
+AWAY = 0.2  # rad from an end that is not
 QUIET_TIME, QUIET_VELOCITY = 1.0, 0.05  # s, rad/s: the robot hangs still
 TORQUE_SHARE = 0.03  # of a joint's torque that friction may hold, where the model says less
 SYMMETRY = 0.25  # rad between left and right, hanging
@@ -78,6 +79,9 @@ class Track:
     jumped: float = 0.0  # rad at once, farther than any hand moves it
     _anchor: float = field(default=np.nan, repr=False)
     _since: float = field(default=np.inf, repr=False)
+    _held: float = field(default=np.nan, repr=False)  # rad, where it was held last
+    _left: bool = field(default=False, repr=False)  # since then
+    again: bool = False  # held where it was held before, and left, and came back
 
     def see(self, time: float, position: float) -> None:
         """The motor is at ``position`` (rad)."""
@@ -86,6 +90,10 @@ class Track:
         self.low, self.high, self.last = min(self.low, position), max(self.high, position), position
         if not abs(position - self._anchor) <= REST:
             self._anchor, self._since = position, time
+        self._left |= abs(position - self._held) > AWAY
+        if time - self._since >= HOLD_TIME and (self._left or np.isnan(self._held)):
+            self.again = abs(position - self._held) < NEAR
+            self._held, self._left = position, False
 
     @property
     def span(self) -> float:
@@ -128,11 +136,13 @@ def measure(
                 f"{joint}: moved over {mine.span:.3f} rad, expected {expected:.3f} between its stops ({position[0]:g} to "
                 f"{position[1]:g}): is this the joint, and are these its stops?"
             )
-        if mine.span >= expected - SPAN_TOLERANCE and (sign := mine.end(now)):
+        reach = config.joints[index].reach
+        whole = mine.span >= expected - SPAN_TOLERANCE if reach == "both" else mine.again
+        if whole and (end_held := mine.end(now)):
             break
         others = [
             (name, t.span) for name, t in zip(config.joint_names, tracks, strict=True)
-            if abs(t.span - expected) < SPAN_TOLERANCE and t.end(now) and mine.span < expected / 4
+            if reach == "both" and abs(t.span - expected) < SPAN_TOLERANCE and t.end(now) and mine.span < expected / 4
         ]  # fmt: skip
         if others:
             named = " or ".join(name for name, _ in others)
@@ -144,7 +154,12 @@ def measure(
             raise Sim2realError(
                 f"{joint}: moved over {mine.span:.3f} of {expected:.3f} rad within {timeout:g} s, expected both stops"
             )
-    offset = (mine.low + mine.high) / 2 - sign * sum(position) / 2
+    sign = -end_held if reach == "lower" else end_held
+    if reach == "both":
+        offset = (mine.low + mine.high) / 2 - sign * sum(position) / 2
+    else:
+        stop = mine.high if end_held > 0 else mine.low
+        offset = stop - sign * position[reach == "upper"]
     bus, id = motors.place[joint]
     return MotorCalibration(
         joint=joint, bus=bus, id=id, fingerprint=motors.fingerprint[joint], sign=1 if sign > 0 else -1,

@@ -16,17 +16,21 @@ from drivers.bus import BusSpec
 SPEED = 1.5  # rad/s at which a joint is moved
 GRIP = 15.0  # rad/s, how firmly it is held: the natural frequency of joint and hand
 BEYOND = 0.1  # rad that the hand would go on behind the stop
+YIELD = 0.15  # rad by which it runs ahead of a joint that does not follow
+BACK = 0.6  # rad from a stop, to come back to it
 HOLD_TIME = 1.2  # s at each stop
 
 
 class Person:
     """Moves the joints of ``world`` while it advances. ``ranges``: by joint, where its stops are (rad); ``limbs``: by
-    joint, of which limb it is."""
+    joint, of which limb it is; ``reach``: by joint, the one stop that can be reached, where it is only one."""
 
     def __init__(
-        self, world: Any, ranges: Mapping[str, tuple[float, float]], limbs: Mapping[str, str], timestep: float = 0.002
-    ) -> None:
+        self, world: Any, ranges: Mapping[str, tuple[float, float]], limbs: Mapping[str, str],
+        reach: Mapping[str, str] | None = None, timestep: float = 0.002,
+    ) -> None:  # fmt: skip
         self._world, self._ranges, self._limbs, self._timestep = world, ranges, limbs, timestep
+        self._reach = reach or {}
         self._joint = ""
         self._held: dict[str, float] = {}  # where the other hand has the rest of the limb
         self._target = 0.0
@@ -34,7 +38,7 @@ class Person:
         self._stayed = 0.0
 
     def move(self, joint: str) -> None:
-        """From now on: to its lower stop, then to its upper one, and stay there."""
+        """From now on: to its lower stop, then to its upper one, and stay there; or twice to the only one there is."""
         self.let_go()
         low, high = self._ranges[joint]
         plant = self._world.plant
@@ -43,7 +47,11 @@ class Person:
             other: float(plant.joint_pos[plant.joints.index(other)])
             for other, limb in self._limbs.items() if limb == self._limbs[joint] and other != joint
         }  # fmt: skip
-        self._goals = [(low - BEYOND, HOLD_TIME), (high + BEYOND, np.inf)]
+        if (reach := self._reach.get(joint, "both")) == "both":
+            self._goals = [(low - BEYOND, HOLD_TIME), (high + BEYOND, np.inf)]
+        else:
+            stop, back = (high + BEYOND, high - BACK) if reach == "upper" else (low - BEYOND, low + BACK)
+            self._goals = [(stop, HOLD_TIME), (back, 0.0), (stop, np.inf)]
 
     def let_go(self) -> None:
         """Hands off."""
@@ -74,11 +82,15 @@ class Person:
         """Pull at a joint so that it follows ``target`` on its way to ``goal``; returns how far that goes on in ``dt``."""
         step = float(np.clip(goal - target, -SPEED * dt, SPEED * dt))
         plant = self._world.plant
-        i = plant.joints.index(joint)
         weight, inertia = plant.weight_on(joint)
-        pull = GRIP**2 * (target + step - plant.joint_pos[i]) + 2 * GRIP * (step / dt - plant.joint_vel[i])
+        ahead = float(np.clip(target + step - self._at(joint), -YIELD, YIELD))
+        velocity = plant.joint_vel[plant.joints.index(joint)]
+        pull = GRIP**2 * ahead + 2 * GRIP * (step / dt - velocity)
         plant.pull(joint, weight + inertia * float(pull))
         return step
+
+    def _at(self, joint: str) -> float:
+        return float(self._world.plant.joint_pos[self._world.plant.joints.index(joint)])
 
 
 def assembled(specs: Sequence[BusSpec], seed: int) -> list[BusSpec]:

@@ -19,6 +19,12 @@ from sim2real.config import RobotConfig, Wiring, load_robot
 from sim2real.robot import open_robot
 from sim2real.types import Sim2realError
 
+ASK = {  # by the stops that can be reached
+    "both": "to its lower end ({low:g} rad), then to its upper end ({high:g} rad), and hold it there",
+    "upper": "to its upper end ({high:g} rad), hold it, move it away, then to the same end again, and hold it there",
+    "lower": "to its lower end ({low:g} rad), hold it, move it away, then to the same end again, and hold it there",
+}
+
 
 @dataclass
 class Args:
@@ -94,7 +100,7 @@ def _measure(
         whole = progress.add_task("joints", total=len(motors.config.joints), completed=kept)
         for joint in joints:
             low, high = joint.position
-            ask(joint.name, f"to its lower end ({low:g} rad), then to its upper end ({high:g} rad), and hold it there")
+            ask(joint.name, ASK[joint.reach].format(low=low, high=high))
             part = progress.add_task(joint.name, total=high - low)
             done = measure(motors, joint.name, timeout, lambda span, part=part: _show(progress, part, span))
             progress.remove_task(part)
@@ -146,7 +152,8 @@ def _simulated(config: RobotConfig, wiring: Wiring, seed: int, console: Console)
     world = open_world(config.model_path, config.base, specs, wiring.imu_spec(), joint_pos=home, hang=0.3, seed=seed)
     # An arm that hangs crooked gets caught at the head; legs hang clear of everything as they are.
     limbs = {j.name: f"{j.name.partition('_')[0]} arm" if j.group == "arm" else j.name for j in config.joints}
-    person = Person(world, {j.name: j.position for j in config.joints}, limbs)
+    reach = {j.name: j.reach for j in config.joints}
+    person = Person(world, {j.name: j.position for j in config.joints}, limbs, reach)
     clock = SimClock(person.advance, lambda: world.time)
     clock.sleep_until(1.0)
     motors = Motors(config, open_robot(config, bare(wiring), {**world.wires, "imu": world.imu_wire}), clock)
