@@ -78,6 +78,7 @@ REGISTERS: dict[str, tuple[int, int]] = {  # address, size
     "GOAL_POSITION": (42, 2),
     "TORQUE_LIMIT": (48, 2),
     "LOCK": (55, 1),
+    "PRESENT_POSITION": (56, 2),
     "STATUS": (65, 1),
 }
 GOAL_AT, GOAL = (

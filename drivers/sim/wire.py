@@ -137,7 +137,9 @@ class SimCan:
         return np.frombuffer(b"".join(raws), FRAME)
 
     def retune(self, bitrate: int) -> None:
-        """The host's controller now runs at ``bitrate``."""
+        """The host's controller was started anew, at ``bitrate``; what it still had to send is gone."""
+        self._queue.clear()
+        self.sent.clear()
         self._bit = 1.0 / bitrate
         self._motors.retune(self.index, bitrate)
 

@@ -8,6 +8,7 @@ other into error frames give them away.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from drivers.bus import BusSpec, Clock, MotorSpec
 from drivers.codecs import damiao
 from drivers.codecs.damiao import Operation
-from drivers.wire import ERROR, CanWire, make_frames
+from drivers.wire import ERROR, CanWire, WireFull, make_frames
 
 ANSWER_TIME = 0.01  # s for the answers to one batch of questions
 POLL_PERIOD = 0.001  # s between two looks at the wire
@@ -114,8 +115,12 @@ def _converse(
 
 
 def converse(wire: CanWire, clock: Clock, frames: np.ndarray, swept: Sweep, time: float = ANSWER_TIME) -> Iterator[Any]:
-    """Send ``frames``; each FRAME that comes back within ``time`` s. Error frames are counted. Raises WireError."""
-    wire.send(frames)
+    """Send ``frames``; each FRAME that comes back within ``time`` s. Error frames are counted. Raises WireError.
+
+    A queue that is full is a bus on which nobody acknowledges: nobody answers either.
+    """
+    with suppress(WireFull):
+        wire.send(frames)
     start = clock.now()
     for n in range(round(time / POLL_PERIOD)):
         clock.sleep_until(start + (n + 1) * POLL_PERIOD)
