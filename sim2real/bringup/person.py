@@ -1,6 +1,7 @@
 """A simulated person who calibrates a simulated robot: hands on its joints, eyes on its body, no idea of its motors.
 
-One hand moves a joint; the other holds the rest of the limb in the middle of its ranges, out of the way.
+One hand moves a joint; the other holds the rest of the limb in the middle of its ranges, out of the way, and
+somewhere else where the joint still runs into something before its stop.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ SPEED = 1.5  # rad/s at which a joint is moved
 GRIP = 15.0  # rad/s, how firmly it is held: the natural frequency of joint and hand
 BEYOND = 0.1  # rad that the hand would go on behind the stop
 YIELD = 0.15  # rad by which it runs ahead of a joint that does not follow
+PATIENCE = 1.5  # s
 BACK = 0.6  # rad from a stop, to come back to it
 HOLD_TIME = 1.2  # s at each stop
 
@@ -35,7 +37,9 @@ class Person:
         self._held: dict[str, float] = {}  # where the other hand has the rest of the limb
         self._target = 0.0
         self._goals: list[tuple[float, float]] = []  # (where to, how long to stay there)
-        self._stayed = 0.0
+        self._stayed = self._blocked = 0.0
+        self._posture: dict[str, float] = {}  # where the other hand wants the rest of the limb
+        self._random = np.random.default_rng(0)
 
     def move(self, joint: str) -> None:
         """From now on: to its lower stop, then to its upper one, and stay there; or twice to the only one there is."""
@@ -47,6 +51,7 @@ class Person:
             other: float(plant.joint_pos[plant.joints.index(other)])
             for other, limb in self._limbs.items() if limb == self._limbs[joint] and other != joint
         }  # fmt: skip
+        self._posture = {other: sum(self._ranges[other]) / 2 for other in self._held}
         if (reach := self._reach.get(joint, "both")) == "both":
             self._goals = [(low - BEYOND, HOLD_TIME), (high + BEYOND, np.inf)]
         else:
@@ -57,7 +62,7 @@ class Person:
         """Hands off."""
         for joint in (self._joint, *self._held) if self._joint else ():
             self._world.plant.pull(joint, 0.0)
-        self._joint, self._held, self._stayed = "", {}, 0.0
+        self._joint, self._held, self._stayed, self._blocked = "", {}, 0.0, 0.0
 
     def advance(self, until: float) -> None:
         """Let time pass in the world, and hands do what they do."""
@@ -71,8 +76,14 @@ class Person:
         step = self._grip(self._joint, self._target, goal, dt)
         self._target += step
         for joint, target in self._held.items():
-            self._held[joint] += self._grip(joint, target, sum(self._ranges[joint]) / 2, dt)
-        if not step:
+            self._held[joint] += self._grip(joint, target, self._posture[joint], dt)
+        there = abs(self._at(self._joint) - goal) < 2 * BEYOND
+        self._blocked = 0.0 if there or step else self._blocked + dt
+        if self._blocked > PATIENCE and self._held:
+            self._blocked = 0.0
+            self._posture = {joint: 0.8 * float(self._random.uniform(*self._ranges[joint])) for joint in self._held}
+            self._goals.insert(0, (sum(self._ranges[self._joint]) / 2, 0.5))
+        elif there and not step:
             self._stayed += dt
             if self._stayed > stay:
                 del self._goals[0]

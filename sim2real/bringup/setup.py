@@ -82,8 +82,9 @@ class DamiaoTool:
         list(self._ask(damiao.pack_register(id, damiao.Operation.STORE)))
 
     def position(self, id: int) -> float | None:
-        full = self.read(id, "PMAX")
-        for data in self._ask(damiao.pack_register(id, damiao.Operation.REFRESH)) if full else ():
+        if (full := self.read(id, "PMAX")) is None:
+            return None
+        for data in self._ask(damiao.pack_register(id, damiao.Operation.REFRESH)):
             if int(data[0]) & 0xF == id & 0xF:
                 return (int(data[1]) << 8 | int(data[2])) / 0xFFFF * 2 * full - full
         return None
