@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -117,19 +117,25 @@ def open_wire(spec: BusSpec | ImuSpec) -> Any:
             return _open_dds(spec, where)
         _known("interface", spec.interface, ("serial", "sim") if is_bus else ("serial", "sim", "dds"), where)
         if spec.interface == "sim":
-            return load("drivers.sim.socket_wire:SocketSerialWire")(spec.channel)
-        return load("drivers.serial_wire:PySerialWire")(spec.channel, spec.bitrate if is_bus else spec.baud)
+            return _lasting(lambda: load("drivers.sim.socket_wire:SocketSerialWire")(spec.channel))
+        rate = spec.bitrate if is_bus else spec.baud
+        return _lasting(lambda: load("drivers.serial_wire:PySerialWire")(spec.channel, rate))
     except WireError as error:
         raise BusError(f"{where}: {error}") from error
 
 
 def _open_can(spec: BusSpec, where: str) -> Any:
     if spec.interface == "sim":
-        return load("drivers.sim.socket_wire:SocketCanWire")(spec.channel)
+        return _lasting(lambda: load("drivers.sim.socket_wire:SocketCanWire")(spec.channel))
     if spec.interface == "socketcan":
-        return load("drivers.can_wire:RawCanWire").open(spec.channel)
+        return _lasting(lambda: load("drivers.can_wire:RawCanWire").open(spec.channel))
     _known("interface", spec.interface, ["sim", *load("drivers.can_wire:interfaces")()], where)
     return load("drivers.can_wire:PythonCanWire")(spec.interface, spec.channel, spec.bitrate)
+
+
+def _lasting(make: Callable[[], Any]) -> Any:
+    """A wire that is opened again when its adapter is plugged in again."""
+    return load("drivers.reopening:ReopeningWire")(make)
 
 
 def _open_dds(spec: BusSpec | ImuSpec, where: str) -> Any:

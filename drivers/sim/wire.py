@@ -110,7 +110,7 @@ class SimCan:
         """Queue frames (FRAME, (n,)). Raises WireFull, or WireError while the controller is off the bus."""
         if self._host_faults or now < self._away_until:
             if self.away(now):
-                raise WireError(f"{self.spec.name}: bus off at {now:.3f} s; check cable and termination")
+                raise WireError(f"{self.spec.name}: bus off; check cable and termination")
             for fault in self._host_faults:
                 if fault.kind == "no_buffer" and fault.start <= now < fault.end:
                     if self._random.random() < fault.probability:

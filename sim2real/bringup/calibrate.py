@@ -1,7 +1,7 @@
 """Where a joint's zero is on its motor, and which way it turns: found by moving it by hand from one stop to the other.
 
 Motors are off and only asked. The range of the joint is known from the YAML, that of the motor is measured; they lie on
-each other in two ways, and the end at which the joint was held last, which is to be its upper one, tells which. Where the
+each other in two ways, and the order in which the joint was held at its ends, the lower one first, tells which. Where the
 body blocks one stop (``reach`` in the YAML), the other is enough, touched twice. Then the robot hangs still, and two checks find what a hand did wrong: a limp joint at rest bears no more torque than its friction
 holds, and left and right hang alike.
 """
@@ -70,41 +70,58 @@ class Motors:
 
 @dataclass
 class Track:
-    """Where a motor was while a hand moved its joint. ``turn``: rad that it jumps by where its count wraps."""
+    """Where a motor was while a hand moved its joint. ``turn``: rad that it jumps by where its count wraps.
+
+    ``holds``: where it was held still, one after the other, once it had been moved at all: where it happened to be before
+    says nothing.
+    """
 
     turn: float
     low: float = np.inf  # rad
     high: float = -np.inf
     last: float = np.nan
     jumped: float = 0.0  # rad at once, farther than any hand moves it
+    holds: list[float] = field(default_factory=list)
+    _first: float = field(default=np.nan, repr=False)
+    _moved: bool = field(default=False, repr=False)
     _anchor: float = field(default=np.nan, repr=False)
     _since: float = field(default=np.inf, repr=False)
-    _held: float = field(default=np.nan, repr=False)  # rad, where it was held last
-    _left: bool = field(default=False, repr=False)  # since then
-    again: bool = False  # held where it was held before, and left, and came back
+    _left: bool = field(default=True, repr=False)  # where it was held last
 
     def see(self, time: float, position: float) -> None:
         """The motor is at ``position`` (rad)."""
+        if np.isnan(self._first):
+            self._first = position
         if self.turn and abs(position - self.last) > self.turn / 2:
             self.jumped = position - self.last
         self.low, self.high, self.last = min(self.low, position), max(self.high, position), position
+        self._moved |= abs(position - self._first) > AWAY
         if not abs(position - self._anchor) <= REST:
             self._anchor, self._since = position, time
-        self._left |= abs(position - self._held) > AWAY
-        if time - self._since >= HOLD_TIME and (self._left or np.isnan(self._held)):
-            self.again = abs(position - self._held) < NEAR
-            self._held, self._left = position, False
+        self._left |= bool(self.holds) and abs(position - self.holds[-1]) > AWAY
+        if self._moved and self._left and time - self._since >= HOLD_TIME:
+            self.holds.append(position)
+            self._left = False
 
     @property
     def span(self) -> float:
         """rad between the farthest places."""
         return max(0.0, self.high - self.low)
 
-    def end(self, time: float) -> int:
-        """1: held still at its greatest place, -1: at its least; 0: neither."""
-        if time - self._since < HOLD_TIME:
+    def ends(self) -> int:
+        """Held at both its ends, one after the other: 1 if at its greatest place last, -1 if at its least; 0: not so."""
+        if len(self.holds) < 2:
             return 0
-        return 1 if self.high - self.last < NEAR else -1 if self.last - self.low < NEAR else 0
+        before, last = self.holds[-2:]
+        if before - self.low < NEAR and self.high - last < NEAR:
+            return 1
+        return -1 if self.high - before < NEAR and last - self.low < NEAR else 0
+
+    def twice(self) -> int:
+        """Held at one end, moved away and held there again: 1 at its greatest place, -1 at its least; 0: not so."""
+        if len(self.holds) < 2 or abs(self.holds[-1] - self.holds[-2]) > NEAR:
+            return 0
+        return 1 if self.high - self.holds[-1] < NEAR else -1 if self.holds[-1] - self.low < NEAR else 0
 
 
 def measure(
@@ -120,7 +137,7 @@ def measure(
     expected = position[1] - position[0]
     tracks = [Track(motors.turn[name]) for name in config.joint_names]
     end = clock.now() + timeout
-    mine = tracks[index]
+    mine, reach = tracks[index], config.joints[index].reach
     while True:
         state, now = motors.look(), clock.now()
         for track, q in zip(tracks, state.joint_pos, strict=True):
@@ -136,13 +153,12 @@ def measure(
                 f"{joint}: moved over {mine.span:.3f} rad, expected {expected:.3f} between its stops ({position[0]:g} to "
                 f"{position[1]:g}): is this the joint, and are these its stops?"
             )
-        reach = config.joints[index].reach
-        whole = mine.span >= expected - SPAN_TOLERANCE if reach == "both" else mine.again
-        if whole and (end_held := mine.end(now)):
+        held = mine.twice() if reach != "both" else mine.ends() if mine.span >= expected - SPAN_TOLERANCE else 0
+        if held:
             break
         others = [
             (name, t.span) for name, t in zip(config.joint_names, tracks, strict=True)
-            if reach == "both" and abs(t.span - expected) < SPAN_TOLERANCE and t.end(now) and mine.span < expected / 4
+            if reach == "both" and abs(t.span - expected) < SPAN_TOLERANCE and t.ends() and mine.span < expected / 4
         ]  # fmt: skip
         if others:
             named = " or ".join(name for name, _ in others)
@@ -154,11 +170,11 @@ def measure(
             raise Sim2realError(
                 f"{joint}: moved over {mine.span:.3f} of {expected:.3f} rad within {timeout:g} s, expected both stops"
             )
-    sign = -end_held if reach == "lower" else end_held
+    sign = -held if reach == "lower" else held
     if reach == "both":
         offset = (mine.low + mine.high) / 2 - sign * sum(position) / 2
     else:
-        stop = mine.high if end_held > 0 else mine.low
+        stop = mine.high if held > 0 else mine.low
         offset = stop - sign * position[reach == "upper"]
     bus, id = motors.place[joint]
     return MotorCalibration(
@@ -211,7 +227,11 @@ def checks(
                 f"expected at most {slack[i]:.1f}. Were its ends taken for each other?"
             )
     for left, right, sign in mirror:
-        if abs(q[left] - sign * q[right]) > SYMMETRY:
+        alike = q.copy()
+        alike[right] = sign * q[left]
+        if abs(q[left] - sign * q[right]) > SYMMETRY and (
+            abs(model.gravity_torque(alike, orientation)[right]) > slack[right]  # else friction holds it anywhere
+        ):
             yield (
                 f"{config.joint_names[left]} hangs at {q[left]:.2f} rad and {config.joint_names[right]} at {q[right]:.2f}, "
                 f"expected {'the same' if sign > 0 else 'opposites'} within {SYMMETRY:g}"

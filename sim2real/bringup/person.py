@@ -42,7 +42,7 @@ class Person:
         self._random = np.random.default_rng(0)
 
     def move(self, joint: str) -> None:
-        """From now on: to its lower stop, then to its upper one, and stay there; or twice to the only one there is."""
+        """From now on: from its middle to its lower stop, then to its upper one, and stay there; or twice to the only one there is."""
         self.let_go()
         low, high = self._ranges[joint]
         plant = self._world.plant
@@ -53,10 +53,10 @@ class Person:
         }  # fmt: skip
         self._posture = {other: sum(self._ranges[other]) / 2 for other in self._held}
         if (reach := self._reach.get(joint, "both")) == "both":
-            self._goals = [(low - BEYOND, HOLD_TIME), (high + BEYOND, np.inf)]
+            self._goals = [((low + high) / 2, 0.0), (low - BEYOND, HOLD_TIME), (high + BEYOND, np.inf)]
         else:
             stop, back = (high + BEYOND, high - BACK) if reach == "upper" else (low - BEYOND, low + BACK)
-            self._goals = [(stop, HOLD_TIME), (back, 0.0), (stop, np.inf)]
+            self._goals = [(back, 0.0), (stop, HOLD_TIME), (back, 0.0), (stop, np.inf)]
 
     def let_go(self) -> None:
         """Hands off."""

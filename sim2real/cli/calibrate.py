@@ -20,7 +20,7 @@ from sim2real.robot import open_robot
 from sim2real.types import Sim2realError
 
 ASK = {  # by the stops that can be reached
-    "both": "to its lower end ({low:g} rad), then to its upper end ({high:g} rad), and hold it there",
+    "both": "from the middle of its range to its lower end ({low:g} rad) and hold it, then to its upper end ({high:g} rad) and hold it",
     "upper": "to its upper end ({high:g} rad), hold it, move it away, then to the same end again, and hold it there",
     "lower": "to its lower end ({low:g} rad), hold it, move it away, then to the same end again, and hold it there",
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from test_preflight import rig
@@ -57,7 +59,7 @@ def test_what_was_measured_is_kept_and_gone_on_from(capsys):
     main(["calibrate", "--robot", "bench", "--sim", "--seed", "3"])
     whole = load_calibration(FILE)
     half = whole.model_copy(update={"motors": whole.motors[:1], "checked": False})
-    half.save(__import__("pathlib").Path(FILE))
+    half.save(Path(FILE))
     capsys.readouterr()
     assert main(["calibrate", "--robot", "bench", "--sim", "--seed", "3"]) == 0
     assert "1 joints are measured already" in capsys.readouterr().out
@@ -69,7 +71,7 @@ def test_a_motor_that_was_replaced_since_is_measured_again(capsys):
     main(["calibrate", "--robot", "bench", "--sim", "--seed", "3"])
     whole = load_calibration(FILE)
     old = whole.motors[0].model_copy(update={"fingerprint": "SN 5", "offset": 9.0})
-    whole.model_copy(update={"motors": [old, whole.motors[1]]}).save(__import__("pathlib").Path(FILE))
+    whole.model_copy(update={"motors": [old, whole.motors[1]]}).save(Path(FILE))
     assert main(["calibrate", "--robot", "bench", "--sim", "--seed", "3"]) == 0
     agrees(FILE, 3)
 
@@ -131,14 +133,36 @@ def test_a_count_that_wraps_within_the_range_is_told():
     assert track.jumped == pytest.approx(-6.2)
 
 
-def test_only_the_end_at_which_it_is_held_counts():
-    track = Track(0.0)
-    for n in range(100):
-        track.see(n * 0.02, n * 0.02)
-    assert track.end(1.98) == 0  # still on its way
-    for n in range(50):
-        track.see(2.0 + n * 0.02, 1.98)
-    assert track.end(3.0) == 1 and track.span == pytest.approx(1.98)
+def track(*places: float) -> Track:
+    """Held at each of ``places`` for a second, and moved to the next at 1 rad/s."""
+    seen, time, here = Track(0.0), 0.0, places[0]
+    for place in places:
+        while abs(place - here) > 0.011:
+            here += 0.01 if place > here else -0.01
+            time += 0.01
+            seen.see(time, here)
+        for _ in range(100):
+            time += 0.01
+            seen.see(time, place)
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("places", "ends"),
+    [((0.5, 0.0, 1.0), 1), ((0.5, 1.0, 0.0), -1), ((0.0, 1.0), 0), ((1.0, 0.0), 0), ((1.0, 0.0, 1.0), 1),
+     ((0.5, 0.0, 0.6), 0), ((0.5, 0.0), 0), ((0.5, 0.0, 0.5, 1.0), 0)],
+)  # fmt: skip
+def test_only_ends_that_were_held_one_after_the_other_count(places, ends):
+    """Where it was before it was moved does not: a leg that starts at its upper end has not been brought there."""
+    assert track(*places).ends() == ends
+
+
+@pytest.mark.parametrize(
+    ("places", "twice"),
+    [((0.5, 1.0, 0.4, 1.0), 1), ((0.5, 0.0, 0.4, 0.0), -1), ((0.5, 1.0), 0), ((1.0, 0.5, 1.0), 0), ((0.5, 1.0, 0.4, 0.8), 0)],
+)  # fmt: skip
+def test_one_stop_counts_when_it_was_touched_twice(places, twice):
+    assert track(*places).twice() == twice
 
 
 @pytest.mark.parametrize("wrong", ["sign", "offset"])
@@ -172,12 +196,12 @@ def test_left_and_right_that_hang_otherwise_contradict():
     state = r.preflight.robot  # connected below, in motor coordinates, which here are the joints'
     state.connect(r.preflight.clock)
     seen = r.preflight.look(5)
-    hip = config.joint_names.index("left_hip_yaw_joint")
+    hip = config.joint_names.index("left_hip_pitch_joint")
     seen.joint_pos[:] = 0.0
     seen.joint_pos[hip] = 0.4
     lines = list(checks(config, "imu_in_pelvis", calibration.motors, seen, np.array([1.0, 0, 0, 0])))
-    assert any("left_hip_yaw_joint hangs at 0.40 rad and right_hip_yaw_joint at 0.00" in line for line in lines)
-    seen.joint_pos[config.joint_names.index("right_hip_yaw_joint")] = -0.4
+    assert any("left_hip_pitch_joint hangs at 0.40 rad and right_hip_pitch_joint at 0.00" in line for line in lines)
+    seen.joint_pos[config.joint_names.index("right_hip_pitch_joint")] = 0.4
     lines = list(checks(config, "imu_in_pelvis", calibration.motors, seen, np.array([1.0, 0, 0, 0])))
     assert not any("hangs at" in line for line in lines)
 
