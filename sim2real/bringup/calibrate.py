@@ -110,18 +110,20 @@ class Track:
 
     def ends(self) -> int:
         """Held at both its ends, one after the other: 1 if at its greatest place last, -1 if at its least; 0: not so."""
-        if len(self.holds) < 2:
-            return 0
-        before, last = self.holds[-2:]
-        if before - self.low < NEAR and self.high - last < NEAR:
-            return 1
-        return -1 if self.high - before < NEAR and last - self.low < NEAR else 0
+        held = self._held_ends()
+        return held[-1] if len(held) > 1 and held[-1] != held[-2] else 0
 
     def twice(self) -> int:
         """Held at one end, moved away and held there again: 1 at its greatest place, -1 at its least; 0: not so."""
-        if len(self.holds) < 2 or abs(self.holds[-1] - self.holds[-2]) > NEAR:
-            return 0
-        return 1 if self.high - self.holds[-1] < NEAR else -1 if self.holds[-1] - self.low < NEAR else 0
+        held = self._held_ends()
+        return held[-1] if held and held.count(held[-1]) > 1 else 0
+
+    def _held_ends(self) -> list[int]:
+        """At which of its ends it was held, in turn; what was held between them does not count. Empty: not at one now."""
+        if not self.holds or min(self.high - self.holds[-1], self.holds[-1] - self.low) > NEAR:
+            return []
+        sides = [1 if self.high - h < NEAR else -1 if h - self.low < NEAR else 0 for h in self.holds]
+        return [side for side in sides if side]
 
 
 def measure(

@@ -150,7 +150,7 @@ def track(*places: float) -> Track:
 @pytest.mark.parametrize(
     ("places", "ends"),
     [((0.5, 0.0, 1.0), 1), ((0.5, 1.0, 0.0), -1), ((0.0, 1.0), 0), ((1.0, 0.0), 0), ((1.0, 0.0, 1.0), 1),
-     ((0.5, 0.0, 0.6), 0), ((0.5, 0.0), 0), ((0.5, 0.0, 0.5, 1.0), 0)],
+     ((0.5, 0.0, 1.0, 0.6), 0), ((0.5, 0.0), 0), ((0.5, 0.0, 0.5, 1.0), 1)],
 )  # fmt: skip
 def test_only_ends_that_were_held_one_after_the_other_count(places, ends):
     """Where it was before it was moved does not: a leg that starts at its upper end has not been brought there."""
