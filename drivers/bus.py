@@ -150,6 +150,11 @@ class MotorBus(Protocol):
         """The protocol's name for a ``MotorState.error`` code."""
         ...
 
+    def fingerprints(self) -> list[str]:
+        """What tells each motor from any other in its place, such as its serial number; "": its protocol tells nothing.
+        Once connected, and disabled; blocks as ``connect`` does. Raises BusError."""
+        ...
+
     def close(self) -> None: ...
 
 

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.wire import ERROR, EXTENDED, FRAME, REMOTE, WireError, WireFull, make_frames
+from drivers.wire import ERROR, EXTENDED, FRAME, REMOTE, WireError, WireFull, WireGone, make_frames
 
 FRAME_SIZE = FRAME.itemsize
 ID_MASK = 0x1FFF_FFFF
+GONE = (errno.ENODEV, errno.ENXIO, errno.EBADF)  # the interface was unregistered, not only set down
 CAN_RAW_ERR_FILTER = 2  # linux/can/raw.h
 ERRORS_HEARD = 0x04 | 0x40 | 0x100  # linux/can/error.h: controller problems, bus-off, restarted
 
@@ -65,7 +66,8 @@ class RawCanWire:
                 sent = f"sent {at // FRAME_SIZE} of {len(frames)} frames"
                 if error.errno in (errno.ENOBUFS, errno.EAGAIN):
                     raise WireFull(f"{sent}: {error.strerror}") from None
-                raise WireError(f"{sent}: {error.strerror}; is the interface up?") from None
+                kind = WireGone if error.errno in GONE else WireError
+                raise kind(f"{sent}: {error.strerror}; is the interface up?") from None
 
     def recv(self) -> np.ndarray:
         received = []
@@ -75,7 +77,8 @@ class RawCanWire:
             except BlockingIOError:
                 break
             except OSError as error:
-                raise WireError(f"receiving: {error.strerror}; is the interface up?") from None
+                kind = WireGone if error.errno in GONE else WireError
+                raise kind(f"receiving: {error.strerror}; is the interface up?") from None
             if len(received[-1]) != FRAME_SIZE:
                 raise WireError(
                     f"receiving: got {len(received[-1])} bytes, expected a frame of {FRAME_SIZE}; wire closed?"

@@ -48,6 +48,7 @@ class JointConfig(Strict):
     damping: Positive  # N m s/rad: kd while damping
     thermometer: bool = True  # its motor reports a temperature; false: a motor that says nothing passes as cold
     group: Literal["leg", "waist", "arm", "hand", "head"]
+    reach: Literal["both", "lower", "upper"] = "both"  # stops that a hand brings it to; the body blocks the other
     source: str  # where the numbers come from, with the hardware variant
 
     @model_validator(mode="after")

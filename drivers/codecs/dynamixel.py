@@ -245,6 +245,8 @@ class DynamixelCodec:
         10.0 * (GOAL_ITEM.itemsize + 1 + STATUS.itemsize + 6),
     )
     TICK_OVERHEAD_BITS = 10.0 * 2 * (OVERHEAD + 4)
+    IDENTITY = ("MODEL", "FIRMWARE")  # there is no serial number: a servo of the same make passes for another
+    TURN = 2 * np.pi
     ERROR_REGISTER = "HARDWARE_ERROR"
     HAS_FAST_READ = True
 

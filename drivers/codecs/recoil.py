@@ -207,6 +207,8 @@ class RecoilCodec:
     # gains of every motor in each.
     TICK_BITS = (120.5 + 115.1 + (77.0 + 84.0) / 3, 135.0 + 135.0 + (85.0 + 95.0) / 3 + 2 * 135.0)
     TICK_OVERHEAD_BITS = 120.0
+    IDENTITY = ()
+    TURN = 0.0  # the count of the motor's own turns is lost, and with it the joint's zero
     MOTOR_FRAMES = 2 + 2 / 3
 
     def __init__(self, spec: BusSpec) -> None:

@@ -79,7 +79,7 @@ class SimServos:
         self._damping = np.array([dynamixel.damping_of(m) for m in models])
         self._unit = np.array([dynamixel.torque_scale(m) for m in models])
         self._gain = np.array([dynamixel.gain_scale(m) for m in models])
-        self.row_of = {m.id: row for row, m in enumerate(spec.motors)}
+        self._bitrate = spec.bitrate  # at which the host talks now
         self._table = np.zeros((n, TABLE_SIZE), np.uint8)
         baud = {rate: code for code, rate in dynamixel.BAUD_RATES.items()}.get(spec.bitrate, 1)
         for row, (motor, model) in enumerate(zip(spec.motors, models, strict=True)):
@@ -93,6 +93,7 @@ class SimServos:
                 self._set(self.joints.index(joint), name, value)
         self._factory = self._table.copy()
         self.powered = [True] * n
+        self._readdress()
         self.temperature = np.full(n, AMBIENT)
         self.last_command_time = np.full(n, -np.inf)  # s, when a goal was last written
         self._turns = np.zeros(n)  # ticks that the count is off the shaft's
@@ -251,8 +252,22 @@ class SimServos:
 
     def _addressed(self, id: int, time: float) -> list[int]:
         """Rows that listen to ``id``, by their ids as they are now."""
-        rows = range(len(self.joints)) if id == BROADCAST else [self.row_of[id]] if id in self.row_of else []
-        return [row for row in rows if self.powered[row] and time >= self._booting[row]]
+        rows = self._row_of.values() if id == BROADCAST else [self._row_of[id]] if id in self._row_of else []
+        return [row for row in rows if time >= self._booting[row]]
+
+    def retune(self, bitrate: int) -> None:
+        """The host now talks at ``bitrate``: who listens at another hears nothing."""
+        self._bitrate = bitrate
+        self._readdress()
+
+    def _readdress(self) -> None:
+        """Whom an id means: of those that have power and listen at the host's bit rate. Of two with one id, one."""
+        known = self._bitrate in dynamixel.BAUD_RATES.values()  # else a line without any time on it
+        self._row_of = {
+            self._get(row, "ID"): row
+            for row in range(len(self.joints))
+            if self.powered[row] and not (known and dynamixel.BAUD_RATES[self._get(row, "BAUD")] != self._bitrate)
+        }
 
     def _refuse(self, packet: Packet, time: float, error: StatusError) -> Iterator[tuple[int, float, bytes] | None]:
         if packet.id != BROADCAST:
@@ -335,8 +350,8 @@ class SimServos:
                 self._switch(row, bool(after[RAM]), time, "enabled" if after[RAM] else "disabled")
             elif name == "BUS_WATCHDOG" and tripped:
                 self._note(time, row, "cleared")
-            elif name == "ID":
-                self.row_of = {self._get(k, "ID"): k for k in range(len(self.joints))}
+            elif name in ("ID", "BAUD"):
+                self._readdress()
             elif r.address in GOALS:
                 self.last_command_time[row] = time
         return StatusError.NONE
@@ -430,6 +445,7 @@ class SimServos:
         if self.powered[row] == on:
             return
         self.powered[row] = on
+        self._readdress()
         self._restart(row, time, "powered on" if on else "powered off")
 
     def _restart(self, row: int, time: float, event: str) -> None:

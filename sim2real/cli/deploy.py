@@ -64,7 +64,9 @@ class Args:
     untuned: bool = False
     """do not ask the kernel for real-time scheduling"""
     hardware: bool = False
-    """drive real motors"""
+    """drive real motors, once everything is proved that can be (sim2real/preflight.py)"""
+    calibration: Path | None = None
+    """with --hardware: the calibration; default: what `sim2real calibrate` wrote for this robot and wiring"""
 
 
 def main(argv: list[str]) -> int:
@@ -101,6 +103,8 @@ def _check(args: Args, config: RobotConfig) -> None:
         )
     if args.hardware and (args.fault or args.video or args.hang):
         raise Sim2realError("--hardware with --fault, --video or --hang: those exist only in simulation; drop them")
+    if args.calibration and not args.hardware:
+        raise Sim2realError("--calibration without --hardware: simulated motors are where the YAML says; drop it")
     if args.visuals and not args.video:
         raise Sim2realError("--visuals without --video: nothing would be shown; add --video FILE.gif")
     if args.video and args.clock != "lockstep":
@@ -159,6 +163,15 @@ def _record_path(where: Path, robot: str) -> Path:
     if where.suffix == ".mcap":
         return where
     return where / f"{robot}-{datetime.now():%Y%m%d-%H%M%S}.mcap"
+
+
+def _calibration(args: Args, config: RobotConfig) -> Path | None:
+    """The calibration that real motors need."""
+    from sim2real.calibration import calibration_path, is_needed
+
+    if not args.hardware or not is_needed(config.wiring(args.wiring)):
+        return None
+    return args.calibration or calibration_path(config.name, args.wiring or config.default_wiring)
 
 
 def _about(args: Args, config: RobotConfig, policies) -> tuple[dict[str, object], dict[str, bytes]]:
@@ -263,6 +276,7 @@ def _realtime(args, config, player, policies, operator, record, console):
                 operator,
                 args.wiring,
                 simulated=not args.hardware,
+                calibration=_calibration(args, config),
                 tune=not args.untuned,
                 seed=args.seed,
                 faults=args.fault,
