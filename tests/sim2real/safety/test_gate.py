@@ -172,7 +172,7 @@ def test_refusal_says_what_where_got_expected_next(bench):
 def test_a_garbled_first_reading_heals(bench, wound):
     bench.tick(**wound)
     bench.tick()
-    bench.tick(10.0)
+    bench.tick(20.0)  # long enough for the slowest joint to have come from there
     bench.tick()
     assert bench.arm() is None
     bench.command_time = 0.0
