@@ -7,6 +7,7 @@ scale errors, vibration, saturation, temperature.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import random
 from collections import deque
@@ -122,6 +123,12 @@ class SimImu:
 
     def inject(self, fault: Fault) -> None:
         self._faults.append(fault)
+
+    def digest(self, sha: hashlib._Hash) -> None:
+        """Add the packets carried since the last call."""
+        if self.carried:
+            sha.update(b"imu:" + b"".join(self.carried))
+            self.carried.clear()
 
     def read(self, now: float) -> bytes:
         """The bytes that have arrived by ``now``."""
