@@ -33,12 +33,7 @@ def rows() -> Iterator[Row]:
     can = BusSpec("can", "damiao", motors)
     yield row("6 motors, CAN at 1 Mbit/s", can, busy(can), "of bits back to back")
     serial = bus_of("XM430-W350", 20, 4_000_000)
-    yield row(
-        "20 Dynamixel servos, 4 Mbit/s",
-        serial,
-        turn(serial),
-        "of turns back to back, a quarter of them the adapter's latency",
-    )
+    yield row("20 Dynamixel servos, 4 Mbit/s", serial, turn(serial), "of turns back to back, 1/4 adapter's latency")
 
 
 def row(words: str, spec: BusSpec, least: float, of: str) -> Row:
@@ -57,16 +52,16 @@ class Rig:
             path.write_text(MODEL.format("".join(JOINT.format(m.joint) for m in spec.motors)))
             self.world = world = open_world(path, "base", [spec], ImuSpec("hipnuc"), hang=None)
         self.clock = SimClock(world.advance, lambda: world.time)
-        self.bus: Any = open_bus(spec, world.wires[spec.name])
-        self.bus.connect(self.clock)
+        self.motors: Any = open_bus(spec, world.wires[spec.name])
+        self.motors.connect(self.clock)
         self.clock.sleep_until(world.time + 0.01)
-        self.bus.read(world.time)
-        self._rng, self.heard_before = np.random.default_rng(0), self.bus.counters.received
+        self.motors.read(world.time)
+        self._rng, self.heard_before = np.random.default_rng(0), self.motors.counters.received
 
     def tick(self) -> None:
-        zero = np.zeros(len(self.bus.spec.motors))
-        self.bus.read(self.world.time)
-        self.bus.write(MotorCommand(self._rng.uniform(-1, 1, len(zero)), zero, zero + 20.0, zero + 1.0, zero))
+        zero = np.zeros(len(self.motors.spec.motors))
+        self.motors.read(self.world.time)
+        self.motors.write(MotorCommand(self._rng.uniform(-1, 1, len(zero)), zero, zero + 20.0, zero + 1.0, zero))
 
 
 def busy(spec: BusSpec) -> float:
@@ -85,9 +80,9 @@ def turn(spec: BusSpec) -> float:
     for _ in range(TICKS):
         sent = rig.world.time
         rig.tick()
-        while rig.bus.waiting > 0:
+        while rig.motors.waiting > 0:
             rig.clock.sleep_until(rig.world.time + LOOK)
-            rig.bus.read(rig.world.time)
+            rig.motors.read(rig.world.time)
         took += rig.world.time - sent
     return took / TICKS
 
@@ -99,7 +94,7 @@ def sustained(spec: BusSpec, period: float) -> bool:
     for k in range(TICKS):
         rig.clock.sleep_until(start + k * period)
         rig.tick()
-        counted = rig.bus.counters
+        counted = rig.motors.counters
         if counted.lost or counted.received - rig.heard_before < n * (k - SLACK):
             return False
     return True
