@@ -7,6 +7,7 @@ scale errors, vibration, saturation, temperature.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import random
 from collections import deque
@@ -69,21 +70,21 @@ class SimImu:
         at = self._samples % BLOCK
         if at == 1 or self._samples == 1:
             self._block = self._generator.standard_normal((BLOCK, 9)) * self._scale + self._mean
-        body, noise = self._body, self._block[at]
+        body, noise = self._body, self._block[at].tolist()
         orientation = body.orientation_imu_in_world.tolist()
         spin, acceleration = body.angular_velocity_imu_in_imu, body.acceleration_imu_in_imu
         if self._mount is not None:
             orientation = multiply(orientation, self._mount)
             spin, acceleration = self._axes.T @ spin, self._axes.T @ acceleration
-        w, x, y, z = multiply(orientation, (1.0, *noise[:3].tolist()))
+        w, x, y, z = multiply(orientation, (1.0, *noise[:3]))
         norm = math.sqrt(w * w + x * x + y * y + z * z)
         packet = hipnuc.pack(
             hipnuc.Hi91(
                 timestamp=now,
                 temperature=TEMPERATURE,
-                acceleration=acceleration + noise[6:9],
-                angular_velocity=spin + noise[3:6],
-                orientation=np.array([w, x, y, z]) / norm,
+                acceleration=[a + b for a, b in zip(acceleration.tolist(), noise[6:9], strict=True)],
+                angular_velocity=[a + b for a, b in zip(spin.tolist(), noise[3:6], strict=True)],
+                orientation=[w / norm, x / norm, y / norm, z / norm],
                 status=0,
             )
         )
@@ -122,6 +123,12 @@ class SimImu:
 
     def inject(self, fault: Fault) -> None:
         self._faults.append(fault)
+
+    def digest(self, sha: hashlib._Hash) -> None:
+        """Add the packets carried since the last call."""
+        if self.carried:
+            sha.update(b"imu:" + b"".join(self.carried))
+            self.carried.clear()
 
     def read(self, now: float) -> bytes:
         """The bytes that have arrived by ``now``."""
