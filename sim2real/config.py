@@ -76,6 +76,7 @@ class SafetyConfig(Strict):
     enable_time: Positive = 0.06  # s, while armed, without a motor saying that it is enabled
     command_age_hold: Positive = 0.04  # s without a fresh command: hold
     command_age: Positive = 0.06  # s without a fresh command: damp
+    object_age: Positive = 0.3  # s without sight of the object that the skill handles: hold, and damp if it lasts
     hold_time: Positive = 0.04  # s: longest hold of any cause, then damp
     arm_tilt: Positive = 0.35  # rad: refuse to arm beyond
     arm_velocity: Positive = 0.5  # rad/s: refuse to arm while any joint moves faster

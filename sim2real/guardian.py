@@ -24,7 +24,7 @@ from sim2real.run import Life, RunSpec, channel, keep_time, sink, tell
 from sim2real.safety import Limits, Safety
 from sim2real.types import JointCommand, Mode
 
-TICK, PILOT = 0, 1  # topics of a record
+TICK, PILOT, OBJECT = 0, 1, 2  # topics of a record
 
 
 class Sink(Protocol):
@@ -145,6 +145,7 @@ class Guardian:
     def _request(self) -> JointCommand | None:
         if self.requests.read():
             self._wish.time = float(self.requests.record["command.time"][0])
+            self._wish.object_time = float(self.requests.record["command.object_time"][0])
         return self._wish if self._wish.time else None
 
     def _obey_operator(self, now: float) -> Calls:
@@ -226,9 +227,9 @@ class Guardian:
         r["fault"] = fault.rule.number if fault else 0
         r["fault_joint"] = fault.joint if fault else -1
         _copy(self._wish, self._requested)
-        r["request.time"] = self._wish.time
+        r["request.time"], r["request.object_time"] = self._wish.time, self._wish.object_time
         _copy(command, self._sent)
-        r["command.time"] = command.time
+        r["command.time"], r["command.object_time"] = command.time, command.object_time
         r["timing.safety"], r["timing.write"] = judged - start, written - judged
         counted = [
             (b.counters.sent, b.counters.received, b.counters.rejected, b.counters.lost) for b in self.robot.buses

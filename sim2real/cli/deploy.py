@@ -207,9 +207,9 @@ def _lockstep(args, config, player, policies, operator, record, console):
 
     sink = None
 
-    def sink_for(ticks, pilots):
+    def sink_for(layouts):
         nonlocal sink
-        sink = Direct(record, {"/tick": ticks, "/pilot": pilots}, *_about(args, config, policies))
+        sink = Direct(record, layouts, *_about(args, config, policies))
         return sink
 
     simulation = Simulation(
@@ -241,15 +241,13 @@ def _realtime(args, config, player, policies, operator, record, console):
     from sim2real.console import Status
     from sim2real.launch import Launch
     from sim2real.operators.keyboard import KEYS
-    from sim2real.pilot import layout_of
+    from sim2real.pilot import topics
     from sim2real.recorder.process import Recorder
-    from sim2real.records import tick_layout
 
     recorder = None
     if record:
         buses = [b.name for b in config.wiring(args.wiring).buses]
-        layouts = {"/tick": tick_layout(config.joint_names, buses), "/pilot": layout_of(player)}
-        recorder = Recorder(record, layouts, *_about(args, config, policies))
+        recorder = Recorder(record, topics(config, buses, player), *_about(args, config, policies))
     try:
         with Status(console, KEYS if args.operator == "keyboard" else "") as status:
             launch = Launch(

@@ -15,7 +15,7 @@ from sim2real.recorder.reader import Reader
 from sim2real.records import pilot_layout, tick_layout
 from sim2real.types import Sim2realError
 
-TICK, PILOT = "/tick", "/pilot"
+TICK, PILOT, OBJECT = "/tick", "/pilot", "/object"
 STAGES = ("standby", "engage", "run")  # of skills.Stage
 
 
