@@ -12,7 +12,7 @@ from policies.basics import Basics
 from policies.randomisation import TABLE
 from sim2real.config import load_robot
 from sim2real.operators.script import ScriptOperator, Step
-from sim2real.policy import load_policy
+from sim2real.policy import load_policy, read_contract
 from sim2real.simulation import Scene, Simulation
 from sim2real.summary import Summary
 
@@ -25,16 +25,21 @@ def deploy_episode(
     ``push``: m/s, the largest of random pushes, as in training but without their spin; 0: none.
     """
     rng = np.random.default_rng(seed)
-    robot = load_robot(config.robot)
     duration = sum(seconds for _, seconds in steps)
     pushes = list(random_pushes(rng, config, duration, push)) if push else []
-    simulation = Simulation(
-        robot,
-        [load_policy(path, robot, trial=0)],
-        ScriptOperator([Step(label, seconds) for label, seconds in steps]),
-        Scene(seed=seed, prepare=random_body(rng), pushes=pushes),
-    )
-    return simulation.run()
+    return deployed(path, steps, Scene(seed=seed, prepare=random_body(rng), pushes=pushes)).run()
+
+
+def deployed(
+    path: Path,
+    steps: list[tuple[str, float]],
+    scene: Scene,
+    each_tick: Callable[[Simulation], None] | None = None,
+) -> Simulation:
+    """A lockstep run of a policy file, to be run: ``steps`` (label, seconds) on the robot that it was made for."""
+    robot = load_robot(read_contract(path).robot)
+    operator = ScriptOperator([Step(label, seconds) for label, seconds in steps])
+    return Simulation(robot, [load_policy(path, robot, trial=0)], operator, scene, each_tick=each_tick)
 
 
 def stayed_up(summary: Summary, seconds: float) -> bool:

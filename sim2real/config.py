@@ -166,6 +166,8 @@ class RobotConfig(Strict):
     safety: SafetyConfig = SafetyConfig()
     home: PoseConfig  # where a soft start goes when the policy says nothing else
     policies: dict[str, PolicyEntry] = {}
+    default_skills: str = ""
+    skills: dict[str, Annotated[list[str], Field(min_length=1)]] = {}  # sets of policies that are loaded together
     default_wiring: str
     wirings: dict[str, Wiring]
 
@@ -178,6 +180,11 @@ class RobotConfig(Strict):
             raise ValueError(f"joints: got {repeated} more than once, expected every name once")
         if self.default_wiring not in self.wirings:
             raise ValueError(f"default_wiring: got '{self.default_wiring}', expected one of {sorted(self.wirings)}")
+        if self.skills and self.default_skills not in self.skills:
+            raise ValueError(f"default_skills: got '{self.default_skills}', expected one of {sorted(self.skills)}")
+        for name in (n for names in self.skills.values() for n in names):
+            if name not in self.policies:
+                raise ValueError(f"skills: got policy '{name}', expected one of {sorted(self.policies)}")
         for table in ("joints", "kp", "kd"):
             for name in getattr(self.home, table):
                 if name not in names:
@@ -271,6 +278,18 @@ class RobotConfig(Strict):
                 f"{self.name}: no wiring '{name}'{did_you_mean(name, self.wirings)}; it has {', '.join(self.wirings)}"
             )
         return self.wirings[name]
+
+    def skill_set(self, name: str = "") -> list[PolicyEntry]:
+        """The policies of the set ``name``, or of the default one. Raises ConfigError where there is none."""
+        name = name or self.default_skills
+        if name not in self.skills:
+            which = f"skills '{name}'" if name else "skills"
+            known = f"; it has {', '.join(self.skills)}" if self.skills else ""
+            raise ConfigError(
+                f"{self.name}: its YAML names no {which}{did_you_mean(name, self.skills)}{known};"
+                " give a policy with --policy FILE.onnx, or name a set under 'skills:'"
+            )
+        return [self.policies[policy] for policy in self.skills[name]]
 
 
 def robot_names() -> list[str]:

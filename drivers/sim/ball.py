@@ -166,6 +166,11 @@ class Ball:
         return self._data.qvel[self._qvel : self._qvel + 3].copy()
 
     @property
+    def radius(self) -> float:
+        """m."""
+        return float(self._model.geom(NAME).size[0])
+
+    @property
     def carried(self) -> bool:
         return bool(self._data.eq_active[self._grip])
 

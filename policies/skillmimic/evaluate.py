@@ -60,6 +60,34 @@ def evaluate(
     Success: no termination of ``config.terminations``. ``push``: m/s, the largest of random pushes. ``act``: what to do,
     (episodes, n); by default what ``graph.actor`` says.
     """
+    rows = run(graph, episodes, seconds, push, seed, act)
+    return result(rows.failed, rows.sums, rows.frames)
+
+
+class Rows(NamedTuple):
+    """Of every episode, each with ``episodes`` rows."""
+
+    skill: np.ndarray  # label index
+    failed: np.ndarray  # bool
+    sums: np.ndarray  # (episodes, 4) of Measures over the frames
+    frames: np.ndarray  # until it failed, or ended
+
+
+def result(failed: np.ndarray, sums: np.ndarray, frames: np.ndarray) -> Result:
+    """What episodes amount to, from the columns of Rows."""
+    body, ball, contact, right = (sums.sum(axis=0) / frames.sum()).tolist()
+    return Result(Rate(int((~failed).sum()), len(failed)), right, body, ball, contact)
+
+
+def run(
+    graph: PolicyGraph,
+    episodes: int,
+    seconds: float,
+    push: float = 0.0,
+    seed: int = 0,
+    act: Callable[[Env], Tensor] | None = None,
+) -> Rows:
+    """The episodes of ``evaluate``, one by one."""
     config = dataclasses.replace(
         graph.config,
         envs=episodes,
@@ -71,14 +99,14 @@ def evaluate(
     env.episode_length_buf[:] = 0
     act = act or (lambda e: graph.actor(e.observation))
     running, failed = np.full(episodes, True), np.full(episodes, False)
-    sums, frames = np.zeros(len(Measures._fields)), 0
+    sums, frames = np.zeros((episodes, len(Measures._fields))), np.zeros(episodes)
+    skill = env.clips.skill[env.clip]
     with torch.no_grad():
         while running.any():
             _, _, dones, _ = env.step(act(env))
-            row = measure(env.now)
-            sums += [values[running].sum() for values in row]
-            frames += int(running.sum())
+            row = np.stack(measure(env.now), axis=1)
+            sums[running] += row[running]
+            frames += running
             failed |= running & env.failures
             running &= ~dones.numpy().astype(bool)
-    body, ball, contact, right = (sums / frames).tolist()
-    return Result(Rate(int((~failed).sum()), episodes), right, body, ball, contact)
+    return Rows(skill, failed, sums, frames)

@@ -21,7 +21,9 @@ from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.train import load_graph
 from policies.train import git_revision
+from sim2real.contract import Contract
 from sim2real.policy import Policy
+from sim2real.types import Sim2realError
 
 SETTINGS = ("robot", "skills", "clips", "swing", "period", "timestep", "action_ratio", "action_max", "grip", "balance_gain",
             "balance_damping", "position_margin", "history", "frames", "terminations")  # fmt: skip
@@ -63,8 +65,8 @@ def export_graph(
         "action_scale": graph.scale.tolist(),
         "object": {"kind": "ball", "radius": ball.RADIUS, "mass": ball.MASS, "restitution": ball.RESTITUTION},
         "skills": [
-            {"label": label, "description": f"{label}, from retargeted clips", "object": object_start(graph, k)}
-            for k, label in enumerate(graph.labels)
+            {"label": label, "description": f"{label}, from retargeted clips", "object": object_start(graph, clip)}
+            for label, clip in zip(graph.labels, first_clips(graph), strict=True)
         ],
         "default_skill": graph.labels[0],
         "history": f"{config.history} ticks, carried in carry_history",
@@ -87,19 +89,32 @@ def export_graph(
 
 
 def settings(config: SkillMimic) -> str:
-    """What ``policies.skillmimic.bytes`` needs to build the graph and its clips again, as JSON."""
+    """What it takes to build the graph and its clips again (``graph_of``), as JSON."""
     return json.dumps({name: getattr(config, name) for name in SETTINGS})
 
 
-def object_start(graph: PolicyGraph, skill: int) -> dict[str, Any]:
-    """How ``skill`` finds the ball, from its first clip: a contract.ObjectStart.
+def graph_of(contract: Contract) -> PolicyGraph:
+    """The graph that ``contract``'s file was exported from, without its actor. Raises Sim2realError where it does not say."""
+    text = contract.provenance.training.get("settings")
+    if not isinstance(text, str):
+        raise Sim2realError(f"{contract.name}: its provenance has no 'settings': export it again (sim2real export)")
+    fields = {name: tuple(v) if isinstance(v, list) else v for name, v in json.loads(text).items()}
+    return PolicyGraph(SkillMimic(**fields))
+
+
+def first_clips(graph: PolicyGraph) -> list[int]:
+    """Of every skill, the number of its first clip."""
+    return [int(np.flatnonzero(graph.clips.skill == k)[0]) for k in range(len(graph.labels))]
+
+
+def object_start(graph: PolicyGraph, clip: int) -> dict[str, Any]:
+    """How the skill of clip number ``clip`` finds the ball there: a contract.ObjectStart.
 
     In the hands if any of them is on it at the start: then at its mean place while hands are on it, which is where they
     are in the posture that the soft start ends in. Else lying or flying, as in the first frame.
     """
     clips = graph.clips
-    first = int(np.flatnonzero(clips.skill == skill)[0])
-    rows = clips.first[first] + np.arange(clips.length[first])
+    rows = clips.first[clip] + np.arange(clips.length[clip])
     m = clips.motion(rows, np.ones(len(rows)))
     base, turn, position, velocity = m.points[:, 0], m.orientation_base_in_world, m.object_position, m.object_velocity
     held = m.contact[:, 0] > 0

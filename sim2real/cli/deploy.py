@@ -32,7 +32,9 @@ class Args:
     wiring: str = ""
     """which of the robot's wirings; default: its default"""
     policy: tyro.conf.UseAppendAction[list[Path]] = field(default_factory=list)
-    """policy files; default: those the robot's YAML names"""
+    """policy files; default: those of --skills"""
+    skills: str = ""
+    """which of the sets of skills that the robot's YAML names; default: its default"""
     skill: str = ""
     """perform only this skill"""
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -59,6 +61,8 @@ class Args:
     """with lockstep: render the run to this .gif"""
     visuals: Path | None = None
     """with --video: an MJCF to show instead, such as the maker's with its meshes (joints matched by name)"""
+    sightings: str = ""
+    """with --hardware: UDP address at which sightings of the object are awaited, HOST:PORT; default 127.0.0.1:47201"""
     untuned: bool = False
     """do not ask the kernel for real-time scheduling"""
     hardware: bool = False
@@ -99,6 +103,9 @@ def _check(args: Args, config: RobotConfig) -> None:
         )
     if args.hardware and (args.fault or args.video):
         raise Sim2realError("--hardware with --fault or --video: those exist only in simulation; drop them")
+    if args.sightings and not args.hardware:
+        raise Sim2realError("--sightings without --hardware: a simulated robot has its own camera; drop it")
+    _address(args.sightings)
     if args.visuals and not args.video:
         raise Sim2realError("--visuals without --video: nothing would be shown; add --video FILE.gif")
     if args.video and args.clock != "lockstep":
@@ -107,18 +114,28 @@ def _check(args: Args, config: RobotConfig) -> None:
         raise Sim2realError("--operator keyboard with --clock lockstep: nobody types that fast; use --clock realtime")
     if (args.velocity != (0.0, 0.0, 0.0) or args.duration) and not args.skill:
         raise Sim2realError("--velocity and --duration belong to one skill: add --skill, or write a --script")
+    if args.skills and args.policy:
+        raise Sim2realError("--skills and --policy: got both, expected one; --policy may be given more than once")
     if args.skill and args.script:
         raise Sim2realError("--skill and --script: got both, expected one")
     config.wiring(args.wiring)
+
+
+def _address(text: str) -> tuple[str, int]:
+    """``HOST:PORT``; empty: the default."""
+    from sim2real.object.packet import ADDRESS
+
+    host, _, port = text.rpartition(":")
+    if text and not (host and port.isdecimal() and 0 < int(port) < 65536):
+        raise Sim2realError(f"--sightings: got '{text}', expected HOST:PORT, e.g. 0.0.0.0:47201")
+    return (host, int(port)) if text else ADDRESS
 
 
 def _policies(args: Args, config: RobotConfig, console: Console):
     from sim2real.policy import load_policy
 
     root = Path(__file__).resolve().parents[2]
-    paths = args.policy or [root / entry.file for entry in config.policies.values()]
-    if not paths:
-        raise Sim2realError(f"{config.name}: its YAML names no policy; give one with --policy FILE.onnx")
+    paths = args.policy or [root / entry.file for entry in config.skill_set(args.skills)]
     policies = [load_policy(path, config) for path in paths]
     for policy in policies:
         contract = policy.contract
@@ -260,6 +277,7 @@ def _realtime(args, config, player, policies, operator, record, console):
                 seed=args.seed,
                 faults=args.fault,
                 recorder=recorder,
+                sightings=_address(args.sightings),
                 show=status.show,
                 timeout=10.0 if args.operator == "script" else 3600.0,
             )
