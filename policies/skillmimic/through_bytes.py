@@ -33,10 +33,10 @@ BEFORE = 2.0  # s of the policy's first skill before another one begins
 
 
 class Judge:
-    """``each_tick`` of a Simulation: from ``begin`` s on, compares it with clip number ``clip`` of ``graph``."""
+    """``each_tick`` of a Simulation: for ``seconds`` from ``begin`` s on, compares it with clip number ``clip`` of ``graph``."""
 
-    def __init__(self, graph: PolicyGraph, clip: int, begin: float) -> None:
-        self.graph, self.clip, self.begin = graph, clip, begin
+    def __init__(self, graph: PolicyGraph, clip: int, begin: float, seconds: float) -> None:
+        self.graph, self.clip, self.begin, self.seconds = graph, clip, begin, seconds
         self.sums, self.frames, self.failed = np.zeros(len(Measures._fields)), 0, False
         self._touched: np.ndarray | None = None
         self._turn, self._shift = np.zeros(4), np.zeros(3)
@@ -47,12 +47,8 @@ class Judge:
         since = simulation.since - self.begin
         touched = body.touching()
         self._touched = touched if self._touched is None else self._touched | touched
-        if (
-            simulation.guardian.record["tick"][0] % simulation.every
-            or since < 0
-            or self.failed
-            or simulation.guardian.done
-        ):
+        decides = simulation.guardian.record["tick"][0] % simulation.every == 0
+        if not (decides and 0 <= since < self.seconds) or self.failed:
             return
         clips, config = self.graph.clips, self.graph.config
         row = np.array([round(since / config.timestep)])
@@ -142,7 +138,7 @@ def deploy_episode(
     if not clips.swing[clip]:
         seconds = min(seconds, (clips.length[clip] - 1) * config.timestep)
     before = [] if label == first else [(first, BEFORE)]
-    judge = Judge(graph, clip, BEFORE if before else 0.0)
+    judge = Judge(graph, clip, BEFORE if before else 0.0, seconds)
     scene = Scene(seed=seed, prepare=random_body(rng), camera=camera, ball=random_ball(rng))
     simulation = deployed(path, [*before, (label, seconds)], scene, judge)
     starts = {n: ObjectStart.model_validate(object_start(graph, clip if n == label else 0)) for n in {first, label}}
