@@ -20,6 +20,7 @@ from policies.training import git_revision
 from sim2real.config import load_robot
 from sim2real.policy import Policy
 
+SHOWN, NONE = (0.4, 0.0, 0.0), (0.0, 0.0, 0.0)  # m/s, m/s, rad/s: commands of a timeline that names none
 GOLDEN_STEPS = 40  # policy ticks of each golden sequence, with two skill switches
 # Below this the policy refuses a switch. Measured on this task: undisturbed robots score 0.7 to 1.1 (1 % of them less),
 # robots that are on the ground half a second later -0.05 to 0.25.
@@ -50,10 +51,17 @@ def release(folder: Path, path: Path, checkpoint: str = "best.pt") -> Policy:
         "kd": robot.home_kd.tolist(),
         "action_scale": graph.scale.tolist(),
         "skills": [  # to stand still is always allowed
-            {"label": label, "description": m.description, "value_min": VALUE_MIN if k else None}
+            {
+                "label": label,
+                "description": m.description,
+                "velocity": SHOWN if m.walks else NONE,
+                "value_min": VALUE_MIN if k else None,
+            }
             for k, (label, m) in enumerate(MOTIONS.items())
         ],
         "default_skill": graph.labels[0],
+        "command_velocity_min": list(config.command_low),
+        "command_velocity_max": list(config.command_high),
         "history": "none: the only memory is carry_*",
         "envelope": envelope(training_signals(graph)),
         "provenance": {

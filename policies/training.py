@@ -136,6 +136,8 @@ class Training:
             raise Sim2realError(
                 f"{checkpoint}: {reason}; expected a checkpoint of this network (best.pt, last.pt)"
             ) from None
+        for group in self.ppo.optimizer.param_groups:  # the other run's came with its optimiser
+            group["lr"] = self.config.learning_rate
 
     def _save(self, name: str) -> None:
         state = {

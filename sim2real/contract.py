@@ -112,6 +112,11 @@ class Skill(Strict):
     description: Text = ""
     next: list[Name] | None = None  # labels it may be followed by; None: any
     dwell: Unsigned = 0.3  # s, shortest stay
+    velocity: tuple[float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+    )  # m/s, m/s, rad/s: at which a timeline shows it that names none
     value_min: float | None = None  # refuse to switch to it while skill_value is below
     object: ObjectStart | None = None  # None: wherever it is
 

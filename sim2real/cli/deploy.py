@@ -84,7 +84,7 @@ def main(argv: list[str]) -> int:
     from sim2real.skills import SkillPlayer
 
     player = SkillPlayer(config, policies)
-    operator = _operator(args, player.labels)
+    operator = _operator(args, player.labels, policies)
     record = None if args.no_record else _record_path(args.record, config.name)
     run = _lockstep if args.clock == "lockstep" else _realtime
     with contextlib.suppress(KeyboardInterrupt):
@@ -152,7 +152,7 @@ def _policies(args: Args, config: RobotConfig, console: Console):
     return policies
 
 
-def _operator(args: Args, labels: list[str]):
+def _operator(args: Args, labels: list[str], policies):
     if args.operator == "keyboard":
         from sim2real.operators.keyboard import KeyboardOperator
 
@@ -162,7 +162,9 @@ def _operator(args: Args, labels: list[str]):
     elif args.skill:
         steps = [Step(args.skill, args.duration or 10.0, args.velocity)]
     else:
-        steps = [Step(labels[0], 2.0), *(Step(label, 5.0) for label in labels[1:]), Step(labels[0], 2.0)]
+        shown = {s.label: s.velocity for policy in policies for s in policy.contract.skills}
+        rest = (Step(label, 5.0, shown[label]) for label in labels[1:])
+        steps = [Step(labels[0], 2.0), *rest, Step(labels[0], 2.0)]
     for step in steps:
         if step.skill not in labels:
             import difflib
