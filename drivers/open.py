@@ -36,6 +36,7 @@ PROTOCOLS: dict[str, BusProtocol] = {
     "cubemars": _can("cubemars", "Cubemars", watchdog=False),
     "robstride_mit": _can("robstride_mit", "RobstrideMit", watchdog=False),
     "odrive": _can("odrive", "Odrive", watchdog=False),
+    "moteus": _can("moteus", "Moteus"),
     "dynamixel": BusProtocol("serial", "drivers.serial_bus:SerialBus", "drivers.codecs.dynamixel:DynamixelCodec"),
     "feetech": BusProtocol("serial", "drivers.serial_bus:SerialBus", "drivers.codecs.feetech:FeetechCodec"),
     "unitree_hg": BusProtocol("dds", "drivers.dds_bus:DdsBus", "drivers.codecs.unitree_hg:UnitreeHgCodec"),
@@ -120,11 +121,11 @@ def open_wire(spec: BusSpec | ImuSpec) -> Any:
 
 def _open_can(spec: BusSpec, where: str) -> Any:
     if spec.interface == "sim":
-        return load("drivers.sim.socket_wire:SocketCanWire")(spec.channel)
+        return load("drivers.sim.socket_wire:SocketCanWire")(spec.channel, spec.data_bitrate)
     if spec.interface == "socketcan":
-        return load("drivers.can_wire:RawCanWire").open(spec.channel)
+        return load("drivers.can_wire:RawCanWire").open(spec.channel, spec.bitrate, spec.data_bitrate)
     _known("interface", spec.interface, ["sim", *load("drivers.can_wire:interfaces")()], where)
-    return load("drivers.can_wire:PythonCanWire")(spec.interface, spec.channel, spec.bitrate)
+    return load("drivers.can_wire:PythonCanWire")(spec.interface, spec.channel, spec.bitrate, spec.data_bitrate)
 
 
 def _open_dds(spec: BusSpec | ImuSpec, where: str) -> Any:

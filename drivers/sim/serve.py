@@ -83,8 +83,9 @@ class BusPort:
         self._away = False
 
     def hear(self, data: bytes, now: float) -> bytes:
-        """Rows of FRAME; anything else is dropped."""
-        if len(data) % FRAME.itemsize or (error := self.take(np.frombuffer(data, FRAME), now)) is None:
+        """Rows of the bus's frames; anything else is dropped."""
+        frame = self.bus.frame
+        if len(data) % frame.itemsize or (error := self.take(np.frombuffer(data, frame), now)) is None:
             return b""
         return error.tobytes()
 
@@ -93,11 +94,11 @@ class BusPort:
         try:
             self.bus.send(frames, now)
         except WireFull:
-            return error_frame(CONTROLLER, TX_OVERFLOW)
+            return error_frame(CONTROLLER, TX_OVERFLOW, self.bus.frame)
         except WireError:
             if not self._away:
                 self._away = True
-                return error_frame(BUS_OFF)
+                return error_frame(BUS_OFF, frame=self.bus.frame)
         return None
 
     def give(self, now: float) -> bytes:
@@ -106,16 +107,16 @@ class BusPort:
         away = self.bus.away(now)
         if away != self._away:
             self._away = away
-            raw += error_frame(BUS_OFF if away else RESTARTED).tobytes()
+            raw += error_frame(BUS_OFF if away else RESTARTED, frame=self.bus.frame).tobytes()
         return raw
 
 
-def error_frame(kind: int, reason: int = 0) -> np.ndarray:
-    """One FRAME (1,) as linux/can/error.h has it."""
-    frame = np.zeros(1, FRAME)
-    frame["id"], frame["length"] = ERROR | kind, 8
-    frame["data"][0, 1] = reason
-    return frame
+def error_frame(kind: int, reason: int = 0, frame: np.dtype = FRAME) -> np.ndarray:
+    """One ``frame`` (1,) as linux/can/error.h has it."""
+    made = np.zeros(1, frame)
+    made["id"], made["length"] = ERROR | kind, 8
+    made["data"][0, 1] = reason
+    return made
 
 
 class Server:
@@ -240,7 +241,7 @@ class Server:
         for name, port in self._ports.items():
             out[name] = port.give(now)
             if port.bridge is not None and out[name]:
-                frames = np.frombuffer(out[name], FRAME)
+                frames = np.frombuffer(out[name], self.world.buses[0].frame)
                 try:
                     port.bridge.send(frames[frames["id"] & ERROR == 0])
                 except WireFull:

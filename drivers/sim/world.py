@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.budget import frame_bits
+from drivers.budget import bits_of
 from drivers.bus import BusError, BusSpec, ImuSpec
 from drivers.open import PROTOCOLS, load
 from drivers.sim.faults import IMU, POWER, Fault, parse_fault
@@ -31,7 +31,6 @@ from drivers.sim.motor import MotorEvent, SimMotors
 from drivers.sim.plant import Plant
 from drivers.sim.truth import Truth
 from drivers.sim.wire import QUEUE_LENGTH, TOLERANCE, SimCan, SimCanWire
-from drivers.wire import FRAME
 
 
 class World:
@@ -69,7 +68,7 @@ class World:
         self.time = 0.0
         self.plant = Plant(model_path, joints, base, timestep, prepare, imu.site)
         self.plant.reset(joint_pos, hang=hang, noise=noise, seed=seed)
-        self.motors = _motors_of(buses)(buses, self.plant, frame_bits, registers=registers, wrap=wrap)
+        self.motors = _motors_of(buses)(buses, self.plant, bits_of(buses[0]), registers=registers, wrap=wrap)
         self.buses: list[SimCan] = []
         first = 0
         for i, spec in enumerate(buses):
@@ -129,10 +128,11 @@ class World:
             return
         raws = b"".join([raw for _, _, raw in sent])
         bits = self.motors.refresh(raws)
-        ids = np.frombuffer(raws, FRAME)["id"].tolist()
+        frame = self.buses[0].frame
+        ids = np.frombuffer(raws, frame)["id"].tolist()
         at = 0
         for bus, ready, raw in sent:
-            end = at + len(raw) // FRAME.itemsize
+            end = at + len(raw) // frame.itemsize
             bus.take(ready, raw, ids[at:end], bits[at:end])
             bus.sent.clear()
             at = end
