@@ -37,8 +37,18 @@ PROTOCOLS: dict[str, BusProtocol] = {
     "robstride_mit": _can("robstride_mit", "RobstrideMit", watchdog=False),
     "odrive": _can("odrive", "Odrive", watchdog=False),
     "moteus": _can("moteus", "Moteus"),
-    "dynamixel": BusProtocol("serial", "drivers.serial_bus:SerialBus", "drivers.codecs.dynamixel:DynamixelCodec"),
-    "feetech": BusProtocol("serial", "drivers.serial_bus:SerialBus", "drivers.codecs.feetech:FeetechCodec"),
+    "dynamixel": BusProtocol(
+        "serial",
+        "drivers.serial_bus:SerialBus",
+        "drivers.codecs.dynamixel:DynamixelCodec",
+        "drivers.sim.servo:SimServos",
+    ),
+    "feetech": BusProtocol(
+        "serial",
+        "drivers.serial_bus:SerialBus",
+        "drivers.codecs.feetech:FeetechCodec",
+        "drivers.sim.feetech:SimFeetech",
+    ),
     "unitree_hg": BusProtocol("dds", "drivers.dds_bus:DdsBus", "drivers.codecs.unitree_hg:UnitreeHgCodec"),
 }
 

@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 
 from drivers.bus import BusError, BusSpec, ImuSpec
+from drivers.open import PROTOCOLS, load
 from drivers.sim.faults import IMU, Fault, parse_fault
 from drivers.sim.imu import ImuNoise, SimImu, SimSerialWire
 from drivers.sim.motor import MotorEvent
 from drivers.sim.plant import Plant
 from drivers.sim.serial_line import GAP, SerialLine, SerialLineWire
-from drivers.sim.servo import SimServos
+from drivers.sim.servo_table import TableServos
 from drivers.sim.world import World
 from drivers.wire import WireError
 
@@ -50,9 +51,10 @@ class SerialWorld(World):
         fast: bool = True,
         patient: bool = False,
     ):
-        if strangers := sorted({b.protocol for b in buses} - {"dynamixel"}):
+        known = [name for name, p in PROTOCOLS.items() if p.wire == "serial" and p.motors]
+        if strangers := sorted({b.protocol for b in buses} - set(known)):
             raise BusError(
-                f"no emulated servos for {', '.join(strangers)} on a serial line; expected dynamixel on every bus"
+                f"no emulated servos for {', '.join(strangers)} on a serial line; expected {' or '.join(known)} on every bus"
             )
         joints = [m.joint for b in buses for m in b.motors]
         if unknown := sorted(set(registers or {}) - set(joints)):
@@ -128,13 +130,14 @@ class AllServos:
     ):
         self.joints = [m.joint for b in buses for m in b.motors]
         self.log: list[MotorEvent] = []
-        self.buses: list[SimServos] = []
+        self.buses: list[TableServos] = []
         shared = np.zeros((4, len(self.joints)))
         first = 0
         for spec in buses:
             own = {m.joint: registers[m.joint] for m in spec.motors if m.joint in registers}
             part = BodyPart(body, slice(first, first + len(spec.motors)), shared)
-            self.buses.append(SimServos(spec, part, registers=own, fast=fast, patient=patient, log=self.log))
+            servos = load(PROTOCOLS[spec.protocol].motors)
+            self.buses.append(servos(spec, part, registers=own, fast=fast, patient=patient, log=self.log))
             first += len(spec.motors)
 
     def act(self, start: float, end: float) -> None:
