@@ -58,9 +58,19 @@ WORLDS: dict[str, str] = {
     "serial": "drivers.sim.serial_world:SerialWorld",
 }
 
-IMUS: dict[str, str] = {
-    "hipnuc": "drivers.codecs.hipnuc:Parser",
-    "unitree_hg": "drivers.codecs.unitree_hg:ImuParser",
+
+class ImuProtocol(NamedTuple):
+    """An IMU's protocol: what reads its packets, and the sensor's side for the twin ("module:Class")."""
+
+    parser: str
+    sensor: str = ""
+
+
+IMUS: dict[str, ImuProtocol] = {
+    "hipnuc": ImuProtocol("drivers.codecs.hipnuc:Parser", "drivers.codecs.hipnuc:Sensor"),
+    "witmotion": ImuProtocol("drivers.codecs.witmotion:Parser", "drivers.codecs.witmotion:Sensor"),
+    "bno085": ImuProtocol("drivers.codecs.bno085:Parser", "drivers.codecs.bno085:Sensor"),
+    "unitree_hg": ImuProtocol("drivers.codecs.unitree_hg:ImuParser"),
 }
 
 
@@ -93,7 +103,7 @@ def open_codec(spec: BusSpec) -> Any:
 def open_imu(spec: ImuSpec, wire: Any = None) -> Imu:
     """The IMU of ``spec``; on ``wire`` where given, else on the one that its interface names. Raises BusError."""
     _known("protocol", spec.protocol, IMUS, "imu")
-    parser = load(IMUS[spec.protocol])()
+    parser = load(IMUS[spec.protocol].parser)()
     return load("drivers.imu.serial:SerialImu")(spec, parser, open_wire(spec) if wire is None else wire)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import binascii
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -84,14 +85,15 @@ def frame(payload: bytes) -> bytes:
 def unpack(payload: bytes) -> Hi91:
     """A checked payload whose first byte is TAG, in SI units. Raises ValueError if it is shorter than PAYLOAD."""
     p = np.frombuffer(payload, PAYLOAD, count=1)[0]
-    return Hi91(
-        timestamp=float(p["timestamp"]) * 1e-3,
-        temperature=float(p["temperature"]),
-        acceleration=p["acceleration"].astype(float) * GRAVITY,
-        angular_velocity=np.deg2rad(p["angular_velocity"].astype(float)),
-        orientation=p["orientation"].astype(float),
-        status=int(p["status"]),
-    )
+    with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN
+        return Hi91(
+            timestamp=float(p["timestamp"]) * 1e-3,
+            temperature=float(p["temperature"]),
+            acceleration=p["acceleration"].astype(float) * GRAVITY,
+            angular_velocity=np.deg2rad(p["angular_velocity"].astype(float)),
+            orientation=p["orientation"].astype(float),
+            status=int(p["status"]),
+        )
 
 
 class Parser:
@@ -131,3 +133,17 @@ class Parser:
             at = len(buffer) - (buffer[-1:] == HEAD[:1])  # nothing begins in the rest, but its last byte may
         del buffer[:at]
         return packets
+
+
+class Sensor:
+    """The sensor's side (a ``drivers.sim.imu.Sensor``)."""
+
+    RATE_MAX = 1000.0  # Hz
+
+    def pack(self, time: float, orientation: np.ndarray, spin: np.ndarray, acceleration: np.ndarray) -> bytes:
+        return pack(Hi91(time, 40.0, acceleration, spin, orientation, 0))
+
+    def retell(self, packet: bytes, change: Callable[[bytearray], None]) -> bytes:
+        payload = bytearray(packet[HEAD_SIZE:])
+        change(payload)
+        return frame(bytes(payload))

@@ -18,6 +18,7 @@ import time
 import tty
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -114,7 +115,7 @@ def serve_servos(spec: BusSpec, *, instant: bool = False, fast: bool = True, fau
 def bus_of(model: str, count: int, baud: int = 4_000_000, **changes) -> BusSpec:
     """A bus of ``count`` servos with the ids 1, 2, ... and joints of these names."""
     motors = tuple(MotorSpec(f"servo_{i}", model, i) for i in range(1, count + 1))
-    own = {"protocol": "dynamixel"}
+    own: dict[str, Any] = {"protocol": "dynamixel"}
     if model in feetech.MODELS:
         own = {"protocol": "feetech", "watchdog": feetech.NO_WATCHDOG}
     elif model not in dynamixel.MODELS:
