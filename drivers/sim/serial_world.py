@@ -180,8 +180,6 @@ class BodyPart:
 class SerialPort:
     """A line as ``serve.Server`` offers it to other processes (a serve.Port): bytes either way."""
 
-    bridge = None
-
     def __init__(self, line: SerialLine):
         self._line = line
 
