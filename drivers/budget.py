@@ -9,7 +9,7 @@ counts as the first of the next five. Source: Bosch, "CAN Specification 2.0" (19
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -102,9 +102,11 @@ def frame_bits(frames: np.ndarray) -> np.ndarray:
     extended = (ids >> EXTENDED_SHIFT == EXTENDED >> EXTENDED_SHIFT) & whole
     other = ~(plain | extended)
     bits = np.empty(len(frames), np.int64)
-    bits[plain] = _plain_bits(ids[plain], frames["data"][plain])
-    bits[extended] = _extended_bits(ids[extended], frames["data"][extended])
-    bits[other] = [_any_bits(frame) for frame in frames[other]]
+    if plain.any():
+        bits[plain] = _plain_bits(ids[plain], frames["data"][plain])
+    if extended.any():
+        bits[extended] = _extended_bits(ids[extended], frames["data"][extended])
+    bits[other] = [_any_bits(int(f["id"]), int(f["length"]), f["data"].tobytes()) for f in frames[other]]
     return bits
 
 
@@ -213,17 +215,17 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
     return stuffing, crc_of.reshape(-1)
 
 
-def _any_bits(frame: np.ndarray) -> int:
+@lru_cache(4096)  # short frames are questions and their answers, and these repeat themselves
+def _any_bits(id: int, length: int, data: bytes) -> int:
     """One frame of any kind, bit by bit."""
-    id, length = int(frame["id"]), int(frame["length"])
     remote = f"{bool(id & REMOTE):b}"
     if id & EXTENDED:
         id29 = f"{id & 0x1FFF_FFFF:029b}"
         head = "0" + id29[:11] + "11" + id29[11:] + remote + "00"
     else:
         head = "0" + f"{id & 0x7FF:011b}" + remote + "00"
-    payload = frame["data"][: 0 if id & REMOTE else length]
-    bits = head + f"{length:04b}" + "".join(f"{byte:08b}" for byte in payload.tolist())
+    payload = b"" if id & REMOTE else data[:length]
+    bits = head + f"{length:04b}" + "".join(f"{byte:08b}" for byte in payload)
     crc = 0
     for bit in bits:
         crc = _crc_step(crc, int(bit))

@@ -46,8 +46,9 @@ class BusSpec:
     """One bus of a wiring.
 
     ``interface`` and ``channel`` are python-can's words for CAN (``socketcan``, ``can0``) and ``serial`` plus a device
-    for serial buses. ``bitrate`` in bit/s; ``data_bitrate``: of the payloads on CAN-FD, 0 on classic CAN. ``watchdog``: seconds after which a motor without commands must stop by
-    itself; programmed and read back before torque. 0: it has none, and a person accepts that.
+    for serial buses. ``bitrate`` in bit/s; ``data_bitrate``: of the payloads on CAN-FD, 0 on classic CAN. ``watchdog``:
+    seconds after which a motor without commands must stop by itself; programmed and read back before torque. 0: it has
+    none, and a person accepts that.
     """
 
     name: str
@@ -149,6 +150,11 @@ class MotorBus(Protocol):
 
     def error_name(self, code: int) -> str:
         """The protocol's name for a ``MotorState.error`` code."""
+        ...
+
+    def fingerprints(self) -> list[str]:
+        """What tells each motor from any other in its place, such as its serial number; "": its protocol tells nothing.
+        Once connected, and disabled; blocks as ``connect`` does. Raises BusError."""
         ...
 
     def close(self) -> None: ...

@@ -47,6 +47,8 @@ class CanCodec(Protocol):
     """One protocol on CAN, for the n motors of one bus. Pure: frames in and out, no wire, no clock."""
 
     TICK_BITS: tuple[float, float]  # bits of a motor's command and answer on the wire: typical, worst
+    IDENTITY: tuple[str, ...]  # registers that tell a motor from any other
+    TURN: float  # rad by whose multiples a position may be off after power-on; 0: nobody knows where it starts
     checks: list[RegisterCheck]
 
     def pack_command(self, command: MotorCommand) -> np.ndarray: ...
@@ -123,6 +125,15 @@ class CanBus:
 
     def error_name(self, code: int) -> str:
         return self._codec.error_name(code)
+
+    def fingerprints(self) -> list[str]:
+        if self._clock is None:
+            raise BusError(f"bus {self.spec.name}: not connected; call connect(clock) first")
+        unknown = np.full(len(self.spec.motors), np.nan)
+        told = {name: self._ask(RegisterCheck(name, unknown, ""), [], self._clock) for name in self._codec.IDENTITY}
+        rows = range(len(self.spec.motors))
+        return [", ".join(f"{name} {values[row]:g}" if isinstance(values[row], float) else f"{name} {values[row]}"
+                          for name, values in told.items()) for row in rows]  # fmt: skip
 
     def close(self) -> None:
         self._wire.close()

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from drivers.wire import BIT_RATE_SWITCH, ERROR, EXTENDED, FD_FRAME, FRAME, REMOTE, WireError, WireFull
+from drivers.wire import BIT_RATE_SWITCH, ERROR, EXTENDED, FD_FRAME, FRAME, REMOTE, WireError, WireFull, WireGone
 
 ID_MASK = 0x1FFF_FFFF
+GONE = (errno.ENODEV, errno.ENXIO, errno.EBADF)  # the interface was unregistered, not only set down
 CAN_RAW_ERR_FILTER, CAN_RAW_FD_FRAMES = 2, 5  # linux/can/raw.h
 ERRORS_HEARD = 0x04 | 0x40 | 0x100  # linux/can/error.h: controller problems, bus-off, restarted
 
@@ -74,7 +75,8 @@ class RawCanWire:
                 sent = f"sent {at // size} of {len(frames)} frames"
                 if error.errno in (errno.ENOBUFS, errno.EAGAIN):
                     raise WireFull(f"{sent}: {error.strerror}") from None
-                raise WireError(f"{sent}: {error.strerror}; is the interface up?") from None
+                kind = WireGone if error.errno in GONE else WireError
+                raise kind(f"{sent}: {error.strerror}; is the interface up?") from None
 
     def recv(self) -> np.ndarray:
         received, size = [], self._frame.itemsize
@@ -84,7 +86,8 @@ class RawCanWire:
             except BlockingIOError:
                 break
             except OSError as error:
-                raise WireError(f"receiving: {error.strerror}; is the interface up?") from None
+                kind = WireGone if error.errno in GONE else WireError
+                raise kind(f"receiving: {error.strerror}; is the interface up?") from None
             if len(received[-1]) == FRAME.itemsize:
                 received[-1] = received[-1].ljust(size, b"\0")  # a classic frame, among those of CAN-FD
             elif len(received[-1]) != size:

@@ -106,6 +106,15 @@ class DdsBus:
     def error_name(self, code: int) -> str:
         return self._codec.error_name(code)
 
+    def fingerprints(self) -> list[str]:
+        """Nothing: LowState tells the robot's variant, and no serial number."""
+        return [""] * len(self.spec.motors)
+
+    @property
+    def variant(self) -> int | None:
+        """The robot's mode_machine, once it was heard."""
+        return self._heard
+
     def close(self) -> None:
         self._wire.close()
 

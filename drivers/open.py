@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -20,6 +20,7 @@ class BusProtocol(NamedTuple):
     codec: str
     motors: str = ""
     watchdog: bool = True  # connecting programs one
+    calibrated: bool = False  # the maker did it: positions are those of the joints
 
 
 def _can(name: str, codec: str, watchdog: bool = True) -> BusProtocol:
@@ -48,8 +49,11 @@ PROTOCOLS: dict[str, BusProtocol] = {
         "drivers.serial_bus:SerialBus",
         "drivers.codecs.feetech:FeetechCodec",
         "drivers.sim.feetech:SimFeetech",
+        watchdog=False,
     ),
-    "unitree_hg": BusProtocol("dds", "drivers.dds_bus:DdsBus", "drivers.codecs.unitree_hg:UnitreeHgCodec"),
+    "unitree_hg": BusProtocol(
+        "dds", "drivers.dds_bus:DdsBus", "drivers.codecs.unitree_hg:UnitreeHgCodec", watchdog=False, calibrated=True
+    ),
 }
 
 WORLDS: dict[str, str] = {
@@ -93,7 +97,7 @@ def open_codec(spec: BusSpec) -> Any:
             "  With 0 the wiring says that these motors may go on without the host; set their own time-out with the "
             "maker's tool"
         )
-    if not spec.watchdog and protocol.watchdog and protocol.wire != "dds":
+    if not spec.watchdog and protocol.watchdog:
         raise BusError(
             f"bus {spec.name}: got watchdog 0, expected more: '{spec.protocol}' has one, and it must be used"
         )
@@ -133,19 +137,26 @@ def open_wire(spec: BusSpec | ImuSpec) -> Any:
             return _open_dds(spec, where)
         _known("interface", spec.interface, ("serial", "sim") if is_bus else ("serial", "sim", "dds"), where)
         if spec.interface == "sim":
-            return load("drivers.sim.socket_wire:SocketSerialWire")(spec.channel)
-        return load("drivers.serial_wire:PySerialWire")(spec.channel, spec.bitrate if is_bus else spec.baud)
+            return _lasting(lambda: load("drivers.sim.socket_wire:SocketSerialWire")(spec.channel))
+        rate = spec.bitrate if is_bus else spec.baud
+        return _lasting(lambda: load("drivers.serial_wire:PySerialWire")(spec.channel, rate))
     except WireError as error:
         raise BusError(f"{where}: {error}") from error
 
 
 def _open_can(spec: BusSpec, where: str) -> Any:
     if spec.interface == "sim":
-        return load("drivers.sim.socket_wire:SocketCanWire")(spec.channel, spec.data_bitrate)
+        return _lasting(lambda: load("drivers.sim.socket_wire:SocketCanWire")(spec.channel, spec.data_bitrate))
     if spec.interface == "socketcan":
-        return load("drivers.can_wire:RawCanWire").open(spec.channel, spec.bitrate, spec.data_bitrate)
+        rates = spec.bitrate, spec.data_bitrate
+        return _lasting(lambda: load("drivers.can_wire:RawCanWire").open(spec.channel, *rates))
     _known("interface", spec.interface, ["sim", *load("drivers.can_wire:interfaces")()], where)
     return load("drivers.can_wire:PythonCanWire")(spec.interface, spec.channel, spec.bitrate, spec.data_bitrate)
+
+
+def _lasting(make: Callable[[], Any]) -> Any:
+    """A wire that is opened again when its adapter is plugged in again."""
+    return load("drivers.reopening:ReopeningWire")(make)
 
 
 def _open_dds(spec: BusSpec | ImuSpec, where: str) -> Any:

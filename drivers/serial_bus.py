@@ -53,6 +53,8 @@ class SerialCodec(Protocol):
 
     TICK_BITS: tuple[float, float]  # bits of a servo's command and answer on the wire: typical, worst
     TICK_OVERHEAD_BITS: float  # bits of the packets around all of them
+    IDENTITY: tuple[str, ...]  # registers that tell a servo from another; few do
+    TURN: float  # rad by whose multiples a position may be off after power-on
     ERROR_REGISTER: str  # what a reboot clears; "": nothing does
     HAS_FAST_READ: bool
     checks: list[RegisterCheck]
@@ -272,6 +274,14 @@ class SerialBus:
 
     def error_name(self, code: int) -> str:
         return self._codec.error_name(code)
+
+    def fingerprints(self) -> list[str]:
+        if self._clock is None:
+            raise BusError(f"bus {self.spec.name}: not connected; call connect(clock) first")
+        told = {name: self._ask(name, self._clock) for name in self._codec.IDENTITY}
+        return [
+            ", ".join(f"{name} {values[row]}" for name, values in told.items()) for row in range(len(self.spec.motors))
+        ]
 
     def close(self) -> None:
         self._wire.close()

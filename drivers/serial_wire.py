@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drivers.wire import WireError, WireFull
+from drivers.wire import WireError, WireFull, WireGone
 
 READ_SIZE = 65536  # bytes: more than any tick brings
 
@@ -31,7 +31,7 @@ class PySerialWire:
         try:
             sent = self._port.write(data) or 0
         except self._error as error:
-            raise WireError(f"{self._where}: writing: {error}; unplugged?") from None
+            raise WireGone(f"{self._where}: writing: {error}; unplugged?") from None
         if sent < len(data):
             raise WireFull(f"{self._where}: sent {sent} of {len(data)} bytes; the rest was dropped")
 
@@ -39,7 +39,7 @@ class PySerialWire:
         try:
             return self._port.read(READ_SIZE)
         except self._error as error:
-            raise WireError(f"{self._where}: reading: {error}; unplugged?") from None
+            raise WireGone(f"{self._where}: reading: {error}; unplugged?") from None
 
     def fileno(self) -> int:
         return self._port.fileno()

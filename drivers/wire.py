@@ -29,6 +29,10 @@ class WireError(Exception):
     """A wire cannot carry traffic: what, where, got, expected, next step."""
 
 
+class WireGone(WireError):
+    """The adapter is not there any more: this wire will carry nothing again, another one may (drivers/reopening.py)."""
+
+
 class WireFull(WireError):
     """The transmit queue took only part of the frames (ENOBUFS). The rest was dropped, never queued for later."""
 

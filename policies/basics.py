@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from policies.gait import Stride
 from policies.references import Motion
 
 
@@ -39,6 +40,7 @@ MOTIONS: dict[str, Motion] = {
         hold={"right_shoulder_roll_joint": -1.5, "right_shoulder_yaw_joint": -1.5, "right_elbow_joint": -0.45},
         swing={"right_elbow_joint": 0.55},
     ),
+    "walk": Motion("Walk as commanded: forwards, sideways, turning", period=1.0, walks=True),
 }
 
 
@@ -48,7 +50,7 @@ class Basics:
 
     robot: str = "g1"
     seed: int = 1
-    envs: int = 256
+    envs: int = 512
     threads: int = 2  # of the physics; the networks have one more
     # the policy
     period: float = 0.02  # s
@@ -61,10 +63,7 @@ class Basics:
     balance_offset: float = 0.19  # rad
     balance_gain: float = 2.3  # rad of ankle per rad of pitch
     balance_damping: float = 0.25  # rad per rad/s
-    # And arms that swing against a fall, by swing_gain x what the capture point (an angle) exceeds swing_from by.
-    pendulum: float = 3.6  # 1/s, sqrt(g / height of the centre of mass)
-    swing_from: float = 0.08  # rad
-    swing_gain: float = 6.0  # rad per rad
+    stride: Stride = Stride()
     reference_rate: float = 2.5  # rad/s, the fastest a reference moves
     reference_pull: float = 8.0  # 1/s, how eagerly it moves towards its goal
     position_margin: float = 0.05  # rad inside the mechanical range; wider than the safety gate's
@@ -73,30 +72,40 @@ class Basics:
     episode: float = 10.0  # s
     switch: tuple[float, float] = (1.5, 5.0)  # s between skill switches
     push: tuple[float, float] = (1.5, 4.0)  # s between pushes
-    push_speed: tuple[float, float] = (0.2, 0.8)  # m/s, the largest at curriculum level 0 and 1
+    push_speed: tuple[float, float] = (0.1, 0.7)  # m/s, the largest at curriculum level 0 and 1
     push_least: float = 0.0  # share of the largest push that each has at least
     push_turn: float = 0.6  # rad/s per m/s of push
+    # what the rest of the body does without the balance being told: in a share of the robots, arms and trunk go somewhere
+    # every so often, and the knees bend
+    busy: float = 0.4  # share
+    busy_every: tuple[float, float] = (0.6, 3.0)  # s
+    busy_arms: float = 1.2  # rad from the formula's pose, the furthest
+    busy_waist: float = 0.25  # rad
+    busy_crouch: float = 0.4  # of a full squat
+    command_low: tuple[float, float, float] = (-0.4, -0.3, -0.8)  # m/s, m/s, rad/s
+    command_high: tuple[float, float, float] = (0.8, 0.3, 0.8)
+    command_zero: float = 0.15  # share of commands that are none
+    easy: float = 0.5  # at curriculum level 0, all of this is so much of what it is at level 1
     home_start: float = 0.2  # share of episodes that start at home instead of inside a motion
     # the learner
     horizon: int = 24  # ticks per iteration
-    learning_rate: float = 5e-4  # at the start; then the step size is what keeps the KL divergence at desired_kl
+    learning_rate: float = 4e-4
     samples: float = 6e6
     gamma: float = 0.98
     ppo: dict[str, float | int | str | bool] = field(
         default_factory=lambda: {
             "num_learning_epochs": 4,
-            "num_mini_batches": 6,
+            "num_mini_batches": 4,
             "clip_param": 0.2,
             "lam": 0.95,
             "value_loss_coef": 1.0,
             "entropy_coef": 0.002,
             "max_grad_norm": 1.0,
-            "schedule": "adaptive",  # safe here: observations have fixed scales, no running normaliser to drift
-            "desired_kl": 0.012,
+            "schedule": "fixed",
             "use_clipped_value_loss": False,
         }
     )
-    std: float = 0.25  # of the actions at the start
+    std: float = 0.2  # of the actions at the start
     # checkpoints and evaluation, in iterations
     save_every: int = 200
     evaluate_every: int = 80

@@ -30,6 +30,7 @@ from sim2real.policy import load_policy
 SECONDS = 10.0  # of an episode
 PUSH = 0.5  # m/s
 SINGLE = (0.2, 0.3, 0.4, 0.5)  # m/s
+WALK, WALK_SECONDS = (0.5, 0.0, 0.0), 20.0  # m/s, m/s, rad/s; s
 EVERY = 2.5  # s between the skill changes of the deployed runs
 Tell = Callable[[str], None]
 
@@ -44,6 +45,8 @@ class Evaluation:
     error: dict[str, float]  # rad, mean distance of the joints from their reference, undisturbed
     single: dict[str, Rate]  # one push of exactly so many m/s at 3 s of 6 s, any skill
     switches: dict[str, Rate]  # "first > second"
+    walk: Rate  # WALK_SECONDS of walking at WALK, pushed up to PUSH every 1.5 to 4 s
+    walk_velocity: tuple[float, float]  # m/s, mean forwards and to the left
     trained: Rate  # random skills, in the training environment
     deployed: Rate  # the same, through the bytes
     deployed_pushed: Rate
@@ -93,6 +96,9 @@ def evaluate(path: Path, config: Basics, episodes: int, deployed: int, tell: Tel
         single[f"{speed:g}"] = run_episodes(once, actor, mixed[:, : round(5.9 / config.period)], speed, seed=6).rate()
     tell(f"all {len(pairs)} switches")
     switched = run_episodes(config, actor, switches, seed=3)
+    tell("a long walk, pushed")
+    walk = np.full((min(episodes, len(mixed)), round(WALK_SECONDS / config.period)), labels.index("walk"))
+    walked = run_episodes(config, actor, walk, PUSH, seed=7, command=WALK)
     tell("random skills")
     trained = run_episodes(config, actor, mixed, seed=4)
     runs = {}
@@ -112,6 +118,8 @@ def evaluate(path: Path, config: Basics, episodes: int, deployed: int, tell: Tel
         error={label: float(calm.error[k * episodes : (k + 1) * episodes].mean()) for k, label in enumerate(labels)},
         single=single,
         switches=by([f"{labels[a]} > {labels[b]}" for a, b in pairs], switched, len(switches) // len(pairs)),
+        walk=walked.rate(),
+        walk_velocity=(float(walked.velocity[:, 0].mean()), float(walked.velocity[:, 1].mean())),
         trained=trained.rate(),
         deployed=survived[0.0],
         deployed_pushed=survived[PUSH],
@@ -148,7 +156,8 @@ def card(contract: Contract, e: Evaluation) -> str:
 Measured by `sim2real eval`; do not edit. sha256 `{e.sha256}`
 
 {1 / contract.period:.0f} Hz, {len(contract.target_joint_names)} joints. In: {", ".join(n for n in contract.inputs if not n.startswith("carry_"))}.
-Legs and waist balance around a reference pose that every skill gives by formula (`policies/basics.py`); arms follow it.
+Legs and waist balance around a reference that every skill (`policies/basics.py`) and the gait (`policies/gait.py`) give by
+formula; arms follow it.
 Trained by {training.get("algorithm", "?")} on {float(training.get("samples", 0)) / 1e6:.1f} M samples, seed {training.get("seed", "?")}, revision {contract.provenance.revision[:12]}.
 {training.get("note", "")}
 
@@ -163,6 +172,7 @@ Share of {SECONDS:g} s episodes without a fall, with 95 % confidence, on robots 
 
 - One push of exactly 0.2, 0.3, 0.4, 0.5 m/s in a random direction: {", ".join(f"{r.value:.0%}" for r in e.single.values())}
   survive the next 3 s ({e.single["0.5"].episodes} episodes each).
+- {WALK_SECONDS:g} s of walking at {WALK[0]:g} m/s, pushed as above: {e.walk}; {e.walk_velocity[0]:.3f} m/s forwards, {e.walk_velocity[1]:+.3f} m/s to the left.
 - Every ordered switch: {total}; the worst, `{worst[0]}`, {worst[1].survived} of {worst[1].episodes}.
 - Random skills every {EVERY:g} s: {e.trained} in the training environment, {e.deployed} through the bytes (real codecs,
   emulated motors, safety gate; a fault counts as a fall): {e.gap:+.1f} points lost. Pushed, through the bytes: {e.deployed_pushed}.
@@ -177,8 +187,7 @@ Share of {SECONDS:g} s episodes without a fall, with 95 % confidence, on robots 
 
 ## Limits
 
-- Flat ground only, and nothing in the hands. It cannot walk, and it has not learned to step: it recovers by ankles and
-  hips, so a push is survived while the feet can hold it (about 0.3 m/s forwards or backwards, 0.5 m/s sideways).
+- Flat ground only.
 - It has only ever seen the simulated body of `configs/robots/{contract.robot}.xml`; nobody has run it on hardware.
 - The skills are formulas, not human motion: they show that the path from training to motors is sound.
 """
@@ -205,6 +214,9 @@ def eval_command(file: Path, episodes: int, deployed: int, report: Path | None, 
         rates = [e.switches.get(f"{first} > {second}") for second in contract.skill_labels]
         table.add_row(first, *(f"{r.survived}/{r.episodes}" if r else "-" for r in rates))
     console.print(table)
+    console.print(
+        f"walking at {WALK[0]:g} m/s for {WALK_SECONDS:g} s, pushed: {e.walk}; {e.walk_velocity[0]:.3f} m/s forwards"
+    )
     console.print("one push: " + ", ".join(f"{speed} m/s {rate.value:.0%}" for speed, rate in e.single.items()))
     console.print(
         f"random skills: {e.trained} in training, {e.deployed} through the bytes, {e.gap:+.1f} points lost\n"

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from policies.basics import Basics
 from policies.graph import PolicyGraph, one_hot
-from policies.observations import Signals, gravity_in_base, observe
+from policies.observations import gravity_in_base, observe
 from policies.physics import standing_height, training_model
 from policies.randomisation import Randomisation
 from policies.rewards import Tick, reward
@@ -27,7 +27,7 @@ class Env(VecEnv):
     """One policy period per step, ``config.envs`` robots.
 
     ``script`` (envs, ticks) of label indices fixes which skill is asked for when (evaluation: everything then starts at
-    home); without it labels change at random times. ``level`` in [0, 1] is the push curriculum; it adapts while
+    home, and each robot keeps one velocity command); without it labels and commands change at random times. ``level`` in [0, 1] is the push curriculum; it adapts while
     ``adaptive``, and None turns pushes off.
     """
 
@@ -41,7 +41,8 @@ class Env(VecEnv):
         self.num_actions, joints = len(self.graph.driven), len(self.graph.joint_names)
         self.max_episode_length = round(config.episode / config.period)
         self.episode_length_buf = torch.zeros(n, dtype=torch.long)
-        self.model = training_model(load_robot(config.robot), self.graph.kp, self.graph.kd, config.timestep)
+        robot = load_robot(config.robot)
+        self.model = training_model(robot, self.graph.kp, self.graph.kd, config.timestep)
         self.substeps = round(config.period / config.timestep)
         self.batch = Batch(self.model, n, config.threads)
         self.random = Randomisation(self.batch, self.model)
@@ -52,11 +53,17 @@ class Env(VecEnv):
         }
         self._height = self._height_table()
         labels = len(self.graph.labels)
-        self.skill, self.carry_skill = torch.zeros(n, labels), torch.zeros(n, labels)
-        self.phase, self.reference = torch.zeros(n, 1), torch.zeros(n, joints)
+        self.skill, self.command = torch.zeros(n, labels), torch.zeros(n, 3)
+        self.carries = {k: torch.zeros(n, *v) for k, v in self.graph.inputs().items() if k.startswith("carry_")}
         self.action, self.target = torch.zeros(n, self.num_actions), torch.zeros(n, joints)
-        self._switch_in, self._push_in = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self.pose = torch.zeros(n, joints)
+        group = np.array([j.group for j in robot.joints])
+        self._reach = config.busy_arms * (group == "arm") + config.busy_waist * (group == "waist")
+        squat = self.graph.references.lift[self.graph.labels.index("squat")].numpy()
+        self._crouch = config.busy_crouch * squat * (group == "leg")
+        self._switch_in, self._push_in, self._busy_in = np.zeros((3, n), np.int64)
         self.observation = torch.zeros(0)
+        self._command(np.arange(n))
         self.reset()
 
     # rsl_rl's side
@@ -107,6 +114,7 @@ class Env(VecEnv):
         self._last_action, before = self.action, self.target.numpy()
         self.action = self.graph.clip(action)
         self.target = self.graph.target(self.measured, self.action)
+        self.carries = self.graph.carries(self.measured, self.action)
         delay = np.floor(self.random.drawn["action_delay"][:, 0])
         delay += self.rng.random(self.num_envs) < self.random.drawn["jitter"][:, 0]
         late = np.arange(self.substeps)[None, :, None] < delay[:, None, None]
@@ -117,15 +125,20 @@ class Env(VecEnv):
 
     def _tick(self, last_action: Tensor) -> Tick:
         qpos, qvel = self._qpos, self._qvel
-        reference = self.reference.numpy()
+        seen = self.measured
+        reference, posture = seen.reference.numpy(), seen.posture.numpy()
+        yaw = np.arctan2(2 * (qpos[:, 3] * qpos[:, 6] + qpos[:, 4] * qpos[:, 5]),
+                         1 - 2 * (qpos[:, 5] ** 2 + qpos[:, 6] ** 2))  # fmt: skip
+        cos, sin, (vx, vy) = np.cos(yaw), np.sin(yaw), qvel[:, :2].T
         return Tick(
             joint_pos=qpos[:, 7:],
             joint_vel=qvel[:, 6:],
             gravity_in_base=gravity_in_base(torch.from_numpy(qpos[:, 3:7])).numpy(),
-            velocity_base_in_world=qvel[:, :3],
+            velocity=np.column_stack([cos * vx + sin * vy, cos * vy - sin * vx]),
+            command=seen.command.numpy(),
             angular_velocity_base_in_base=qvel[:, 3:6],
             height=qpos[:, 2],
-            height_reference=np.interp(reference[:, self._knee], *self._height),
+            height_reference=np.interp(posture[:, self._knee], *self._height),
             reference=reference,
             action=self.action.numpy(),
             last_action=last_action.numpy(),
@@ -148,25 +161,10 @@ class Env(VecEnv):
             "joint_vel": _tensor(np.round(joint_vel / VELOCITY_STEP) * VELOCITY_STEP),
             "orientation_base_in_world": _tensor(orientation / np.linalg.norm(orientation, axis=-1, keepdims=True)),
             "angular_velocity_base_in_base": _tensor(gyro),
+            "command_velocity": self.command.clone(),
             "skill": self.skill.clone(),
         }
-        self.carries = {
-            "carry_phase": self.phase,
-            "carry_skill": self.carry_skill,
-            "carry_reference": self.reference,
-            "carry_action": self.action,
-        }
-        self.phase, self.reference = self.graph.references.advance(
-            self.skill, self.carry_skill, self.phase, self.reference
-        )
-        self.carry_skill = self.skill.clone()
-        self.measured = Signals(
-            **self.signals,
-            home=self.graph.home,
-            phase=self.phase,
-            reference=self.reference,
-            last_action=self.action,
-        )
+        self.measured = self.graph.advance(**self.signals, **self.carries, pose=self.pose)
         self.observation = observe(self.measured)
 
     # between periods
@@ -182,6 +180,9 @@ class Env(VecEnv):
             now = np.flatnonzero(self._switch_in <= 0)
             self.skill[now] = one_hot(rng.integers(len(self.graph.labels), size=len(now)), len(self.graph.labels))
             self._switch_in[now] = self._ticks(config.switch, len(now))
+            self._command(now)
+            self._busy_in -= 1
+            self._occupy(np.flatnonzero(self._busy_in <= 0))
         if self.level is None:
             return
         self._push_in -= 1
@@ -194,10 +195,31 @@ class Env(VecEnv):
         self._qvel[now, 3:6] += rng.uniform(-1, 1, (len(now), 3)) * (config.push_turn * speed)[:, None]
         self._push_in[now] = self._ticks(config.push, len(now))
 
+    def _command(self, ids: np.ndarray) -> None:
+        """New velocity commands."""
+        config, k = self.config, len(ids)
+        some = self.rng.random((k, 1)) >= config.command_zero
+        self.command[ids] = _tensor(
+            self.rng.uniform(config.command_low, config.command_high, (k, 3)) * some * self._difficulty
+        )
+
+    def _occupy(self, ids: np.ndarray) -> None:
+        """Bodies that are about something else."""
+        if len(ids) == 0:
+            return
+        config, rng, k = self.config, self.rng, len(ids)
+        pose = rng.uniform(-1, 1, (k, self.model.nu)) * self._reach + rng.uniform(0, 1, (k, 1)) * self._crouch
+        self.pose[ids] = _tensor(pose * (rng.random((k, 1)) < config.busy) * self._difficulty)
+        self._busy_in[ids] = self._ticks(config.busy_every, k)
+
+    @property
+    def _difficulty(self) -> float:
+        return 1.0 if self.level is None else self.config.easy + (1 - self.config.easy) * self.level
+
     def _adapt(self, survived: int, fell: int) -> None:
-        """Push harder while about two episodes of three survive."""
+        """Make it harder while more than half of the episodes survive."""
         if self.adaptive and self.level is not None:
-            self.level = float(np.clip(self.level + 0.002 * (survived - 2 * fell), 0.0, 1.0))
+            self.level = float(np.clip(self.level + 0.002 * (survived - fell), 0.0, 1.0))
 
     def _start(self, ids: np.ndarray) -> None:
         """New robots in ``ids``, each inside some motion at some phase, or at home."""
@@ -212,11 +234,17 @@ class Env(VecEnv):
         at_home = torch.from_numpy(home)[:, None]
         pose = torch.where(at_home, self.graph.home, self.graph.references.goal(skill, phase))
         self.skill[ids] = skill
-        self.carry_skill[ids] = torch.where(at_home, 0.0, skill)
-        self.phase[ids] = torch.where(at_home, 0.0, phase)
-        self.reference[ids] = pose
+        for carry in self.carries.values():
+            carry[ids] = 0.0
+        self.carries["carry_skill"][ids] = torch.where(at_home, 0.0, skill)
+        self.carries["carry_phase"][ids] = torch.where(at_home, 0.0, phase)
+        self.carries["carry_posture"][ids] = pose
         self.target[ids] = pose
         self.action[ids] = 0.0
+        self.pose[ids] = 0.0
+        if self.script is None:
+            self._command(ids)
+            self._occupy(ids)
         joint_pos = np.clip(pose.numpy() + rng.uniform(-0.05, 0.05, pose.shape), *self.model.jnt_range[1:].T)
         yaw, tilt = rng.uniform(-np.pi, np.pi, k), rng.uniform(-0.04, 0.04, (k, 2))
         orientation = multiply(

@@ -50,6 +50,10 @@ class Episodes(NamedTuple):
 
     survived: np.ndarray  # (episodes,) bool
     error: np.ndarray  # (episodes,) rad, mean distance of the joints from their reference
+    life: np.ndarray  # (episodes,) ticks until it fell
+    velocity: (
+        np.ndarray
+    )  # (episodes, 2) m/s, mean of the base over the ground, forwards and to the left, while it is up
 
     def rate(self, where: np.ndarray | slice = slice(None)) -> Rate:
         chosen = self.survived[where]
@@ -83,7 +87,7 @@ class FileActor:
         if not error < 1e-3:
             raise Sim2realError(
                 f"{self.path}: its targets are up to {error:.2g} rad off those of policies/basics.py for the same actions,"
-                " expected the same; it was made with other settings: export it again (sim2real train --export)"
+                " expected the same; it was made with other settings: export it again (sim2real export)"
             )
         return result
 
@@ -93,21 +97,33 @@ def graph_actor(graph: PolicyGraph) -> Actor:
     return lambda env: graph.actor(env.observation)
 
 
-def run_episodes(config: Basics, actor: Actor, script: np.ndarray, push: float = 0.0, seed: int = 0) -> Episodes:
+def run_episodes(
+    config: Basics,
+    actor: Actor,
+    script: np.ndarray,
+    push: float = 0.0,
+    seed: int = 0,
+    command: tuple[float, float, float] | None = None,
+) -> Episodes:
     """One episode per row of ``script`` (episodes, ticks) of label indices, under randomisation that training never saw.
 
-    ``push``: m/s, the largest of random pushes every ``config.push`` seconds; 0: none.
+    ``push``: m/s, the largest of random pushes every ``config.push`` seconds; 0: none. ``command``: forward m/s, left
+    m/s, turn rad/s for skills that walk; None: each robot its own, from the ranges of training.
     """
     config = dataclasses.replace(config, push_speed=(push, push), episode=script.shape[1] * config.period + 1.0)
     env = Env(config, UNSEEN + seed, script, level=1.0 if push else None)
-    survived = np.full(len(script), True)
+    if command is not None:
+        env.command[:] = torch.tensor(command)
+    survived, moved, ticks = np.full(len(script), True), np.zeros((len(script), 2)), np.zeros((len(script), 1))
     errors = np.zeros((script.shape[1], len(script)))
     with torch.no_grad():
         for t in range(script.shape[1]):
             env.step(actor(env))
             survived &= ~env.failures
+            moved += env.tick.velocity * survived[:, None]
+            ticks += survived[:, None]
             errors[t] = np.abs(env.tick.joint_pos - env.tick.reference).mean(axis=-1)
-    return Episodes(survived, errors.mean(axis=0))
+    return Episodes(survived, errors.mean(axis=0), ticks[:, 0], moved / np.maximum(ticks, 1))
 
 
 def skill_script(config: Basics, labels: int, episodes: int, seconds: float) -> np.ndarray:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from policies.basics import MOTIONS, Basics
+from policies.gait import Gait, single_loads
 from policies.observations import Signals, gravity_in_base, observe
 from policies.references import References
 from sim2real.config import RobotConfig, load_robot
@@ -17,17 +19,16 @@ from sim2real.config import RobotConfig, load_robot
 class PolicyGraph(nn.Module):
     """Residual actions on a reference pose.
 
-    ``target = clip(reference + balance + scale * clip(action))``, with the reference from the skill's formula, simple
-    reflexes for balance, and the action (legs and waist) from the actor. ``actor`` and ``critic`` map an observation
-    (N, size) to actions (N, driven) and a value (N, 1); without them
-    the graph still observes and makes targets, which is all that the training environment needs of it.
+    ``target = clip(reference + balance + scale * clip(action))``, with the reference from the skill's formula and the
+    gait's, simple reflexes for balance, and the action (legs and waist) from the actor. ``actor`` and ``critic`` map an
+    observation (N, size) to actions (N, driven) and a value (N, 1); without them the graph still observes and makes
+    targets, which is all that the training environment needs of it.
     """
 
     scale: Tensor
     drive: Tensor
     ankles: Tensor
-    shoulders: Tensor
-    legs: Tensor
+    walks: Tensor
     lower: Tensor
     upper: Tensor
     value_healthy: Tensor
@@ -55,11 +56,13 @@ class PolicyGraph(nn.Module):
         self.register_buffer("drive", torch.diag(self.scale)[self.driven])  # actions to joints
         self.register_buffer("lower", _buffer(robot.position_min + margin))
         self.register_buffer("upper", _buffer(robot.position_max - margin))
-        part = lambda joint: torch.tensor([float(joint in name) for name in robot.joint_names])  # noqa: E731
-        self.register_buffer("ankles", part("ankle_pitch"))
-        self.register_buffer("shoulders", part("shoulder_pitch"))
-        # Thigh and shin are equally long: their mean pitch is that of the line from ankle to hip, here of both legs.
-        self.register_buffer("legs", part("hip_pitch") / 2 + part("knee") / 4)
+        ankles = torch.tensor([float("ankle_pitch" in name) for name in robot.joint_names])
+        self.register_buffer("ankles", ankles)
+        self.register_buffer("walks", torch.tensor([[float(m.walks)] for m in MOTIONS.values()]))
+        body = mujoco.MjModel.from_xml_path(str(robot.model_path))
+        loads = single_loads(body, robot.home_pos, self.kp) * np.array([groups[n] == "leg" for n in groups])
+        loads -= config.balance_offset * ankles.numpy() * (loads != 0)  # which the ankles are told of anyway
+        self.gait = Gait(robot.joint_names, config.period, config.stride, loads)
         self.register_buffer("value_healthy", torch.ones(len(self.labels)))
         self.actor: nn.Module = nn.Identity()
         self.critic: nn.Module = nn.Identity()
@@ -68,38 +71,62 @@ class PolicyGraph(nn.Module):
     def home(self) -> Tensor:
         return self.references.home
 
+    def advance(
+        self,
+        joint_pos: Tensor,
+        joint_vel: Tensor,
+        orientation_base_in_world: Tensor,
+        angular_velocity_base_in_base: Tensor,
+        command_velocity: Tensor,
+        skill: Tensor,
+        carry_phase: Tensor,
+        carry_skill: Tensor,
+        carry_posture: Tensor,
+        carry_command: Tensor,
+        carry_gait: Tensor,
+        carry_action: Tensor,
+        pose: Tensor | float = 0.0,
+    ) -> Signals:
+        """This tick of every robot (N, size): what was measured and asked for, and where the formulas have got to.
+        ``pose`` (N, n) rad moves the goal: what another policy does with the rest of the body."""
+        phase, posture = self.references.advance(skill, carry_skill, carry_phase, carry_posture, pose)
+        command = self.gait.ramp(carry_command, command_velocity * (skill @ self.walks))
+        gravity = gravity_in_base(orientation_base_in_world)
+        lean = self.gait.lean(carry_gait, gravity, angular_velocity_base_in_base, joint_pos - posture, joint_vel)
+        gait = self.gait.advance(carry_gait, command, lean)
+        reference = posture + self.gait.offsets(gait, command, lean)
+        return Signals(joint_pos, joint_vel, gravity, angular_velocity_base_in_base, skill, self.home, phase, posture,
+                       command, gait, reference, carry_action)  # fmt: skip
+
     def target(self, signals: Signals, action: Tensor) -> Tensor:
         """Joint targets (N, n) rad for a clipped ``action`` (N, driven)."""
         target = signals.reference + self.balance(signals) + action @ self.drive
         return torch.minimum(torch.maximum(target, self.lower), self.upper)
 
     def balance(self, signals: Signals) -> Tensor:
-        """What a person does without thinking (N, n) rad: ankles lean against the pitch; arms swing once the capture
-        point, lean + rate / pendulum frequency, comes near the end of the feet (Pratt et al., "Capture Point", 2006)."""
+        """What a person does without thinking (N, n) rad: ankles lean against the pitch."""
         config = self.config
-        pitch = gravity_in_base(signals.orientation_base_in_world)[:, 0:1]  # sine of the forward pitch
-        pitch_rate = signals.angular_velocity_base_in_base[:, 1:2]
-        ankle = config.balance_offset + config.balance_gain * pitch + config.balance_damping * pitch_rate
-        lean = pitch + ((signals.joint_pos - signals.reference) * self.legs).sum(-1, keepdim=True)
-        lean_rate = pitch_rate + (signals.joint_vel * self.legs).sum(-1, keepdim=True)
-        capture = lean + lean_rate / config.pendulum
-        swing = capture - torch.clamp(capture, -config.swing_from, config.swing_from)
-        hanging = (
-            torch.clamp(torch.cos(signals.reference), min=0.0) ** 2
-        )  # raised arms would topple what they should save
-        return ankle * self.ankles + config.swing_gain * swing * hanging * self.shoulders
+        pitch, pitch_rate = signals.gravity_in_base[:, 0:1], signals.angular_velocity_base_in_base[:, 1:2]
+        return (config.balance_offset + config.balance_gain * pitch + config.balance_damping * pitch_rate) * self.ankles
 
     def clip(self, action: Tensor) -> Tensor:
         return torch.clamp(action, -self.config.action_max, self.config.action_max)
 
+    def carries(self, signals: Signals, action: Tensor) -> dict[str, Tensor]:
+        """What the next tick has to be told of this one."""
+        return {
+            "carry_phase": signals.phase,
+            "carry_skill": signals.skill,
+            "carry_posture": signals.posture,
+            "carry_command": signals.command,
+            "carry_gait": signals.gait,
+            "carry_action": action,
+        }
+
     def carry_start(self) -> dict[str, list[float]]:
         """What each carried tensor is before the first tick; an empty list is zeros."""
-        return {
-            "carry_phase": [],
-            "carry_skill": [],
-            "carry_reference": self.home.tolist(),
-            "carry_action": [],
-        }
+        names = [n for n in self.inputs() if n.startswith("carry_")]
+        return {n: self.home.tolist() if n == "carry_posture" else [] for n in names}
 
     def inputs(self) -> dict[str, list[int]]:
         """Every input by name with its shape, without the batch axis, in the order of ``forward``."""
@@ -109,23 +136,24 @@ class PolicyGraph(nn.Module):
             "joint_vel": [n],
             "orientation_base_in_world": [4],
             "angular_velocity_base_in_base": [3],
+            "command_velocity": [3],
             "skill": [labels],
             "carry_phase": [1],
             "carry_skill": [labels],
-            "carry_reference": [n],
+            "carry_posture": [n],
+            "carry_command": [3],
+            "carry_gait": [1],
             "carry_action": [len(self.driven)],
         }
 
     def outputs(self) -> dict[str, list[int]]:
         """Every output by name with its shape, without the batch axis, in the order of ``forward``."""
         n, labels = len(self.joint_names), len(self.labels)
-        size = 3 + 3 + 2 * n + len(self.driven) + labels + 2 + n
+        nexts = {f"{name}_next": shape for name, shape in self.inputs().items() if name.startswith("carry_")}
+        size = 3 + 3 + 2 * n + len(self.driven) + labels + 2 + 3 + 2 + n
         return {
             "joint_pos_target": [n],
-            "carry_phase_next": [1],
-            "carry_skill_next": [labels],
-            "carry_reference_next": [n],
-            "carry_action_next": [len(self.driven)],
+            **nexts,
             "observation": [size],
             "action": [len(self.driven)],
             "skill_value": [labels],
@@ -137,10 +165,13 @@ class PolicyGraph(nn.Module):
         joint_vel: Tensor,
         orientation_base_in_world: Tensor,
         angular_velocity_base_in_base: Tensor,
+        command_velocity: Tensor,
         skill: Tensor,
         carry_phase: Tensor,
         carry_skill: Tensor,
-        carry_reference: Tensor,
+        carry_posture: Tensor,
+        carry_command: Tensor,
+        carry_gait: Tensor,
         carry_action: Tensor,
     ) -> tuple[Tensor, ...]:
         """One tick of a batch of one. Returns the tensors of ``outputs()`` in that order.
@@ -150,20 +181,17 @@ class PolicyGraph(nn.Module):
         """
         every = torch.eye(len(self.labels))
         rows = lambda x: x.expand(len(self.labels), -1)  # noqa: E731
-        phases, references = self.references.advance(every, rows(carry_skill), rows(carry_phase), rows(carry_reference))
-        measured = joint_pos, joint_vel, orientation_base_in_world, angular_velocity_base_in_base
-        observations = observe(Signals(*map(rows, measured), every, self.home, phases, references, rows(carry_action)))
+        measured = joint_pos, joint_vel, orientation_base_in_world, angular_velocity_base_in_base, command_velocity
+        carried = carry_phase, carry_skill, carry_posture, carry_command, carry_gait, carry_action
+        might = self.advance(*map(rows, measured), every, *map(rows, carried))
+        observations = observe(might)
+        signals = Signals(*(x if x is self.home else skill @ x for x in might))
         observation = skill @ observations
-        phase, reference = skill @ phases, skill @ references
-        signals = Signals(*measured, skill, self.home, phase, reference, carry_action)
         action = self.clip(self.actor(observation))
         value = (self.critic(observations).T / self.value_healthy).reshape(1, -1)
         return (
             self.target(signals, action),
-            phase,
-            skill + 0.0,
-            reference,
-            action,
+            *self.carries(signals, action).values(),
             observation,
             action + 0.0,
             value,

@@ -36,9 +36,9 @@ class Mirrored(nn.Module):
 def observation_mirror(graph: PolicyGraph) -> Turn:
     """How an observation turns over in the plane y = 0 of the base."""
     joints, labels = len(graph.joint_names), len(graph.labels)
-    blank = Signals(*(torch.zeros(1, k) for k in (joints, joints, 4, 3, labels)), home=torch.zeros(joints),
-                    phase=torch.zeros(1, 1), reference=torch.zeros(1, joints),
-                    last_action=torch.zeros(1, len(graph.driven)))  # fmt: skip
+    zeros = lambda k: torch.zeros(1, k)  # noqa: E731
+    blank = Signals(zeros(joints), zeros(joints), zeros(3), zeros(3), zeros(labels), zeros(joints), zeros(1), zeros(joints),
+                    zeros(3), zeros(1), zeros(joints), zeros(len(graph.driven)))  # fmt: skip
     index: list[int] = []
     sign: list[float] = []
     for _, kind, term in TERMS.values():
@@ -48,6 +48,8 @@ def observation_mirror(graph: PolicyGraph) -> Turn:
             "axial": ([0, 1, 2], [-1.0, 1.0, -1.0]),
             "joints": joint_mirror(graph.joint_names),
             "actions": action_mirror(graph),
+            "command": ([0, 1, 2], [1.0, -1.0, -1.0]),
+            "gait": ([0, 1], [-1.0, -1.0]),  # the other foot's half of the stride
             "same": (list(range(size)), [1.0] * size),
         }[kind]
         index += [len(sign) + k for k in where]

@@ -57,6 +57,11 @@ def _com(fields: Fields, model: mujoco.MjModel, ids: np.ndarray, x: np.ndarray) 
     fields["body_ipos"][ids, torso] = model.body_ipos[torso] + x
 
 
+def _hand_load(fields: Fields, model: mujoco.MjModel, ids: np.ndarray, x: np.ndarray) -> None:
+    for side, load in zip(("left", "right"), x.T, strict=True):
+        fields["body_mass"][ids, model.body(f"{side}_wrist_yaw_link").id] += load
+
+
 def _kp(fields: Fields, model: mujoco.MjModel, ids: np.ndarray, x: np.ndarray) -> None:
     fields["actuator_gainprm"][ids, :, 0] = model.actuator_gainprm[:, 0] * x
     fields["actuator_biasprm"][ids, :, 1] = model.actuator_biasprm[:, 1] * x
@@ -76,6 +81,7 @@ TABLE: dict[str, Term] = {
     "mass": Term(0.95, 1.05, "bodies", "x: cables, covers, hands that the description leaves out", _mass),
     "torso_load": Term(-1.0, 2.0, 1, "kg: battery, computer, backpack", _load),
     "torso_com": Term(-0.03, 0.03, 3, "m: where that load sits", _com),
+    "hand_load": Term(0.0, 0.4, 2, "kg a hand: a ball, a tool, gloves", _hand_load),
     # the motors
     "kp": Term(0.9, 1.1, "joints", "x: torque constants differ by some 10 %", _kp),
     "kd": Term(0.8, 1.2, "joints", "x: velocity is estimated in the motor", _kd),

@@ -20,6 +20,7 @@ class Motion(NamedTuple):
     hold: Mapping[str, float] = {}
     lift: Mapping[str, float] = {}
     swing: Mapping[str, float] = {}
+    walks: bool = False  # obeys the velocity command
 
 
 class References(nn.Module):
@@ -66,13 +67,16 @@ class References(nn.Module):
         lift, swing = (1 - torch.cos(angle)) / 2, torch.sin(angle)
         return self.home + skill @ self.hold + lift * (skill @ self.lift) + swing * (skill @ self.swing)
 
-    def advance(self, skill: Tensor, last_skill: Tensor, phase: Tensor, reference: Tensor) -> tuple[Tensor, Tensor]:
-        """Phase (N, 1) and reference pose (N, n) of this tick from those of the last one.
+    def advance(
+        self, skill: Tensor, last_skill: Tensor, phase: Tensor, reference: Tensor, further: Tensor | float = 0.0
+    ) -> tuple[Tensor, Tensor]:
+        """Phase (N, 1) and reference pose (N, n) of this tick from those of the last one; ``further`` (N, n) rad is
+        added to the formula's.
 
         A new label starts at phase 0. ``last_skill`` all zero (the start state) counts as another label.
         """
         same = (skill * last_skill).sum(-1, keepdim=True)
         phase = phase + (skill * self.phase_rate).sum(-1, keepdim=True)
         phase = same * (phase - torch.floor(phase))
-        move = self.share * (self.goal(skill, phase) - reference)
+        move = self.share * (self.goal(skill, phase) + further - reference)
         return phase, reference + torch.clamp(move, -self.step, self.step)

@@ -15,7 +15,8 @@ from policies.env import Env
 from policies.evaluate import UNSEEN, random_script
 from policies.export import envelope, export
 from policies.graph import PolicyGraph
-from policies.train import git_revision, load_graph
+from policies.train import load_graph
+from policies.training import git_revision
 from sim2real.config import load_robot
 from sim2real.policy import Policy
 
@@ -28,6 +29,10 @@ SETTLED = 100  # ticks after which an undisturbed episode counts as healthy
 
 def release(folder: Path, path: Path, checkpoint: str = "best.pt") -> Policy:
     """Export a checkpoint of the run in ``folder`` to ``path`` and return the proved policy. Raises Sim2realError."""
+    if "skills" in json.loads((folder / "config.json").read_text())["config"]:
+        from policies.skillmimic.release import release as release_skills
+
+        return release_skills(folder, path, checkpoint)
     graph = load_graph(folder, checkpoint)
     config, robot = graph.config, load_robot(graph.config.robot)
     graph.value_healthy.copy_(healthy_values(graph))

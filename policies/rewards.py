@@ -17,7 +17,8 @@ class Tick(NamedTuple):
     joint_pos: np.ndarray
     joint_vel: np.ndarray
     gravity_in_base: np.ndarray
-    velocity_base_in_world: np.ndarray
+    velocity: np.ndarray  # (N, 2) m/s of the base over the ground, forwards and to the left
+    command: np.ndarray  # (N, 3) m/s, m/s, rad/s
     angular_velocity_base_in_base: np.ndarray
     height: np.ndarray  # (N,) m, of the base
     height_reference: np.ndarray  # (N,) m, with the feet flat at the reference pose
@@ -39,12 +40,13 @@ def _near(error: np.ndarray, width: float) -> np.ndarray:
 
 
 REWARDS: dict[str, Reward] = {
-    "upper_body": Reward(0.25, lambda t: _near((t.joint_pos - t.reference)[:, UPPER], 0.7)),
-    "legs": Reward(0.2, lambda t: _near((t.joint_pos - t.reference)[:, LEGS], 0.6)),
+    "upper_body": Reward(0.15, lambda t: _near((t.joint_pos - t.reference)[:, UPPER], 0.7)),
+    "legs": Reward(0.15, lambda t: _near((t.joint_pos - t.reference)[:, LEGS], 0.6)),
     "upright": Reward(0.2, lambda t: _near(t.gravity_in_base[:, :2], 0.2)),
     "height": Reward(0.1, lambda t: _near((t.height - t.height_reference)[:, None], 0.08)),
-    "still": Reward(0.15, lambda t: _near(t.velocity_base_in_world[:, :2], 0.35)),
-    "steady": Reward(0.1, lambda t: _near(t.angular_velocity_base_in_base, 1.0)),
+    "velocity": Reward(0.3, lambda t: _near(t.velocity - t.command[:, :2], 0.3)),
+    "turn": Reward(0.05, lambda t: _near((t.angular_velocity_base_in_base - t.command)[:, 2:], 0.4)),
+    "steady": Reward(0.05, lambda t: _near(t.angular_velocity_base_in_base[:, :2], 1.0)),
     "action_rate": Reward(-0.006, lambda t: np.sum(np.square(t.action - t.last_action), axis=-1)),
     "action": Reward(-0.002, lambda t: np.sum(np.square(t.action), axis=-1)),
     "joint_vel": Reward(-0.0005, lambda t: np.sum(np.square(t.joint_vel), axis=-1)),

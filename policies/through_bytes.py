@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from policies.basics import Basics
+from policies.basics import MOTIONS, Basics
 from policies.randomisation import TABLE
 from sim2real.config import load_robot
 from sim2real.operators.script import ScriptOperator, Step
@@ -31,10 +31,16 @@ def deploy_episode(
     simulation = Simulation(
         robot,
         [load_policy(path, robot, trial=0)],
-        ScriptOperator([Step(label, seconds) for label, seconds in steps]),
+        ScriptOperator([Step(label, seconds, command(label, rng, config)) for label, seconds in steps]),
         Scene(seed=seed, prepare=random_body(rng), pushes=pushes),
     )
     return simulation.run()
+
+
+def command(label: str, rng: np.random.Generator, config: Basics) -> tuple[float, float, float]:
+    """A velocity command as in training, for a skill that obeys one."""
+    forward, left, turn = rng.uniform(config.command_low, config.command_high) * MOTIONS[label].walks
+    return float(forward), float(left), float(turn)
 
 
 def stayed_up(summary: Summary, seconds: float) -> bool:

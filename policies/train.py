@@ -1,161 +1,41 @@
-"""PPO (rsl_rl) on the training environment: resumable, self-evaluating, keeping the checkpoint that survives best."""
+"""Training the basics, and the command that trains any task."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import io
-import json
-import os
-import subprocess
-from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
+from rsl_rl.modules import MLP
 from torch import nn
 
+from policies import training
 from policies.basics import Basics
 from policies.env import Env
 from policies.evaluate import quick_survival
+from policies.gait import Stride
 from policies.graph import PolicyGraph
 from policies.mirror import Mirrored, Turn, action_mirror, observation_mirror
 from sim2real.types import Sim2realError
 
-Report = Callable[[dict[str, float]], None]
 
+class Training(training.Training):
+    """The basics: one observation for actor and critic (the exported critic sees what the actor sees), both symmetric."""
 
-class Training:
-    """One run in ``folder``: ``config.json``, ``curve.jsonl``, ``last.pt`` (resumes) and ``best.pt`` (survives best).
-
-    Under torchrun every process simulates ``config.envs`` robots of its own and the gradients are averaged (gloo).
-    """
-
-    def __init__(self, config: Basics, folder: Path) -> None:
-        self.config, self.folder = config, folder
-        self.rank, self.world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
-        torch.set_num_threads(1)
-        torch.manual_seed(config.seed + self.rank)
-        if self.world > 1:
-            torch.distributed.init_process_group("gloo")
-        self.env = Env(config, config.seed + 1000 * self.rank)
-        self.ppo = make_ppo(config, self.env, self.rank, self.world)
-        if self.world > 1:
-            self.ppo.broadcast_parameters()
-        self.iteration, self.samples, self.best = 0, 0, -1.0
-
-    def run(self, report: Report = lambda row: None) -> None:
-        """Until ``config.samples`` have been seen. ``report(row)`` after each iteration."""
-        if self.rank == 0:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            (self.folder / "config.json").write_text(json.dumps(self._provenance(), indent=1))
-        while self.samples < self.config.samples:
-            row = self.step()
-            if self.iteration % self.config.evaluate_every == 0 and self.rank == 0:
-                row |= quick_survival(self.config, self.graph())
-                score = (row["survival"] + row["survival_pushed"]) / 2
-                if score >= self.best:
-                    self.best = score
-                    self._save("best.pt")
-            if self.rank == 0:
-                with (self.folder / "curve.jsonl").open("a") as file:
-                    file.write(json.dumps(row) + "\n")
-                report(row)
-            if self.iteration % self.config.save_every == 0 or self.samples >= self.config.samples:
-                if self.rank == 0:
-                    self._save("last.pt")
-                self.env.reset()  # what a resumed run does too, so both continue alike
-
-    def step(self) -> dict[str, float]:
-        """One iteration: collect ``horizon`` ticks, update. Returns a row of the curve."""
-        config, ppo, env = self.config, self.ppo, self.env
-        ppo.train_mode()
-        total, survived, fell = 0.0, 0, 0
-        with torch.no_grad():
-            observations = env.get_observations()
-            for _ in range(config.horizon):
-                observations, rewards, dones, extras = env.step(ppo.act(observations))
-                # Scaled so that the value of an undisturbed state is about 1.
-                ppo.process_env_step(observations, (1 - config.gamma) * rewards, dones, extras)
-                total += float(rewards.mean())
-                survived += int(extras["time_outs"].sum())
-                fell += int(env.failures.sum())
-            ppo.compute_returns(observations)
-        losses = ppo.update()
-        self.iteration += 1
-        self.samples += config.horizon * env.num_envs * self.world
-        return {
-            "iteration": self.iteration,
-            "samples": self.samples,
-            "reward": total / config.horizon,
-            "fell": fell,
-            "survived": survived,
-            "level": env.level or 0.0,
-            "std": float(ppo.actor.output_std.detach().mean()),
-            "learning_rate": ppo.learning_rate,
-            **{f"loss_{k}": float(v) for k, v in losses.items()},
-        }
+    def make(self, seed: int) -> tuple[Env, PPO]:
+        env = Env(self.config, seed)
+        return env, make_ppo(self.config, env)
 
     def graph(self) -> PolicyGraph:
-        """The policy graph with the networks as they are now."""
         graph = PolicyGraph(self.config)
         graph.actor, graph.critic = networks(self.ppo)
         return graph.eval()
 
-    def resume(self) -> bool:
-        """Continue from ``last.pt`` if there is one; then everything goes on as if it had never stopped."""
-        path = self.folder / "last.pt"
-        if not path.is_file():
-            return False
-        state = torch.load(path, weights_only=True)
-        self.ppo.load(state["ppo"], None, strict=True)
-        self.iteration, self.samples, self.best = state["iteration"], state["samples"], state["best"]
-        self.env.load_state_dict(state["env"])
-        torch.set_rng_state(state["torch_rng"])
-        if self.rank > 0:  # the checkpoint holds the first process's dice: the others get their own
-            torch.manual_seed(self.config.seed + self.rank + self.iteration)
-            self.env.rng = np.random.default_rng([self.config.seed, self.rank, self.iteration])
-            self.env.reset()
-        if self.rank == 0:  # what came after the checkpoint never happened
-            curve = self.folder / "curve.jsonl"
-            lines = curve.read_text().splitlines(keepends=True) if curve.is_file() else []
-            curve.write_text("".join(x for x in lines if json.loads(x)["iteration"] <= self.iteration))
-        return True
-
-    def start_from(self, checkpoint: Path) -> None:
-        """Take the networks and the optimiser of another run; samples and curve begin at zero. Raises Sim2realError."""
-        try:
-            self.ppo.load(torch.load(checkpoint, weights_only=True)["ppo"], None, strict=True)
-        except Exception as error:  # torch has no common base for what a wrong file raises
-            reason = str(error).splitlines()[0]
-            raise Sim2realError(
-                f"{checkpoint}: {reason}; expected a checkpoint of this network (best.pt, last.pt)"
-            ) from None
-
-    def _save(self, name: str) -> None:
-        state = {
-            "ppo": self.ppo.save(),
-            "iteration": self.iteration,
-            "samples": self.samples,
-            "best": self.best,
-            "env": self.env.state_dict(),
-            "torch_rng": torch.get_rng_state(),
-        }
-        torch.save(state, self.folder / f"{name}.part")
-        os.replace(self.folder / f"{name}.part", self.folder / name)
-
-    def _provenance(self) -> dict:
-        tools = ("mujoco", "torch", "rsl-rl-lib", "numpy")
-        return {
-            "config": dataclasses.asdict(self.config),
-            "world": self.world,
-            "revision": git_revision(),
-            "tools": {name: version(name) for name in tools},
-        }
+    def evaluate(self) -> dict[str, float]:
+        row = quick_survival(self.config, self.graph())
+        return row | {"score": (row["survival"] + row["survival_pushed"]) / 2}
 
 
 class MirroredModel(MLPModel):
@@ -166,34 +46,12 @@ class MirroredModel(MLPModel):
         self.mlp = Mirrored(self.mlp, observation_mirror, output_mirror)
 
 
-def make_ppo(config: Basics, env: Env, rank: int = 0, world: int = 1) -> PPO:
-    """rsl_rl's PPO with one observation for actor and critic (the exported critic sees what the actor sees)."""
-    network = {"class_name": MirroredModel, "hidden_dims": list(config.hidden), "activation": "elu",
-               "observation_mirror": observation_mirror(env.graph)}  # fmt: skip
-    settings = {
-        "num_steps_per_env": config.horizon,
-        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
-        "actor": {
-            **network,
-            "output_mirror": action_mirror(env.graph),
-            "distribution_cfg": {"class_name": "GaussianDistribution", "init_std": config.std, "std_type": "scalar"},
-        },
-        "critic": {**network, "output_mirror": ([0], [1.0])},
-        "algorithm": {
-            "class_name": "PPO",
-            "gamma": config.gamma,
-            "learning_rate": config.learning_rate,
-            **config.ppo,
-        },
-        "multi_gpu": {"global_rank": rank, "local_rank": rank, "world_size": world} if world > 1 else None,
-    }
-    with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
-        ppo: PPO = PPO.construct_algorithm(env.get_observations(), env, settings, "cpu")
-    with torch.no_grad():
-        last = [m for m in ppo.actor.mlp.modules() if isinstance(m, nn.Linear)][-1]
-        last.weight.mul_(0.01)  # start at the reference pose
-        last.bias.zero_()
-    return ppo
+def make_ppo(config: Basics, env: Env) -> PPO:
+    """rsl_rl's PPO with symmetric networks."""
+    network = {"class_name": MirroredModel, "observation_mirror": observation_mirror(env.graph)}
+    actor = {**network, "output_mirror": action_mirror(env.graph)}
+    critic = {**network, "output_mirror": ([0], [1.0])}
+    return training.make_ppo(config, env, actor, critic, {"actor": ["policy"], "critic": ["policy"]})
 
 
 def networks(ppo: PPO) -> tuple[nn.Module, nn.Module]:
@@ -203,66 +61,73 @@ def networks(ppo: PPO) -> tuple[nn.Module, nn.Module]:
 
 def load_graph(folder: Path, name: str = "best.pt") -> PolicyGraph:
     """The policy graph of a finished or running training. Raises Sim2realError."""
-    if not (folder / name).is_file():
-        raise Sim2realError(f"{folder / name}: no such checkpoint; train first: sim2real train g1-basics")
-    config = load_config(folder)
-    training = Training(dataclasses.replace(config, envs=1), folder)
-    training.ppo.load(torch.load(folder / name, weights_only=True)["ppo"], {"actor": True, "critic": True}, strict=True)
-    return training.graph()
+    return graph_of(folder / name)
+
+
+def graph_of(checkpoint: Path) -> PolicyGraph:
+    """The policy graph in a checkpoint, with its networks. Raises Sim2realError."""
+    state, config = training.read_checkpoint(checkpoint, basics)
+    graph = PolicyGraph(config)
+    size, mirror = graph.outputs()["observation"][0], observation_mirror(graph)
+    for part, outputs, turn in (("actor", len(graph.driven), action_mirror(graph)), ("critic", 1, ([0], [1.0]))):
+        network = Mirrored(MLP(size, outputs, list(config.hidden), "elu"), mirror, turn)
+        network.load_state_dict(training.weights(state, part))
+        setattr(graph, part, network)
+    return graph.eval()
+
+
+def basics(document: dict[str, Any]) -> Basics:
+    """Settings as ``dataclasses.asdict`` gave them."""
+    return Basics(**{**document, "stride": Stride(**document["stride"])})
 
 
 def load_config(folder: Path) -> Basics:
     """The settings written beside a run's checkpoints. Raises Sim2realError if they are of another version."""
-    document: dict[str, Any] = json.loads((folder / "config.json").read_text())["config"]
-    settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in document.items()}
-    names = {f.name for f in dataclasses.fields(Basics)}
-    if strangers := sorted(set(settings) - names):
-        raise Sim2realError(
-            f"{folder / 'config.json'}: got settings {', '.join(strangers)}, which policies/basics.py does not have;"
-            " check out the revision named in that file, or train anew in another folder"
-        )
-    return Basics(**settings)
+    return training.read_config(folder, basics)
 
 
-def git_revision() -> str:
-    """The commit of the working tree, with ``+`` if it has changes; empty outside a repository."""
-    root = Path(__file__).resolve().parents[1]
-    run = lambda *a: subprocess.run(["git", *a], cwd=root, capture_output=True, text=True).stdout.strip()  # noqa: E731
-    with contextlib.suppress(OSError):
-        return run("rev-parse", "HEAD") + ("+" if run("status", "--porcelain", "--", "policies", "configs") else "")
-    return ""
+def tasks() -> dict[str, tuple[Any, Any, Any]]:
+    """Every task by name: its settings, its kind of training, and what reads such settings back."""
+    from policies.skillmimic.config import TASKS
+    from policies.skillmimic.train import SkillTraining, skills
+
+    return {"g1-basics": (Basics(), Training, basics)} | {n: (c, SkillTraining, skills) for n, c in TASKS.items()}
 
 
-def train_command(folder: Path, start: Path | None = None, **settings: float) -> None:
-    """``sim2real train``: a progress line with the time left, and what the run came to."""
+def train_command(task: str, folder: Path, start: Path | None = None, **settings: Any) -> None:
+    """``sim2real train``: a progress line with the time left, and what the run came to. Raises Sim2realError."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    config = load_config(folder) if (folder / "config.json").is_file() else Basics()
-    training = Training(dataclasses.replace(config, **settings), folder)  # type: ignore[arg-type]
-    resumed = training.resume()
+    known = tasks()
+    if task not in known:
+        raise Sim2realError(f"task: got '{task}', expected one of {', '.join(known)}")
+    config, kind, reader = known[task]
+    if (folder / "config.json").is_file():
+        config = training.read_config(folder, reader)
+    if strangers := sorted(set(settings) - {f.name for f in dataclasses.fields(config)}):
+        raise Sim2realError(f"--{strangers[0]}: task '{task}' has no such setting")
+    run = kind(dataclasses.replace(config, **settings), folder)
+    resumed = run.resume()
     if start is not None and not resumed:
-        training.start_from(start)
+        run.start_from(start)
     console = Console()
     console.print(
-        f"{'resuming' if resumed else 'training'} in {folder}: {training.env.num_envs} robots, "
-        f"{training.samples / 1e6:.1f} of {training.config.samples / 1e6:.1f} M samples done"
+        f"{'resuming' if resumed else 'training'} in {folder}: {run.env.num_envs} robots, "
+        f"{run.samples / 1e6:.1f} of {run.config.samples / 1e6:.1f} M samples done"
     )
     columns = (TextColumn("{task.percentage:5.1f} %"), BarColumn(), TimeElapsedColumn(), TextColumn("left"),
                TimeRemainingColumn(elapsed_when_finished=True), TextColumn("{task.description}"))  # fmt: skip
     with Progress(*columns, console=console) as progress:
-        bar = progress.add_task("", total=training.config.samples, completed=training.samples)
+        bar = progress.add_task("", total=run.config.samples, completed=run.samples)
 
         def report(row: dict[str, float]) -> None:
-            text = f"reward {row['reward']:.2f}  fell {row['fell']}  push level {row['level']:.2f}"
+            text = f"reward {row['reward']:.2f}  fell {row['fell']}  level {row['level']:.2f}"
             progress.update(bar, completed=row["samples"], description=text)
-            if "survival" in row:
-                console.print(
-                    f"{row['samples'] / 1e6:6.2f} M samples: {row['survival']:.0%} survive 10 s, "
-                    f"{row['survival_pushed']:.0%} with pushes to 0.5 m/s"
-                )
+            if "score" in row:
+                shares = {k: v for k, v in row.items() if k.startswith(("survival", "success"))}
+                each = ", ".join(f"{k.replace('_', ' ')} {v:.0%}" for k, v in shares.items())
+                console.print(f"{row['samples'] / 1e6:6.2f} M samples: {each}")
 
-        training.run(report)
-    console.print(
-        f"best: {training.best:.1%} mean survival, {folder / 'best.pt'}; next: sim2real train g1-basics --folder {folder} --export FILE.onnx"
-    )
+        run.run(report)
+    console.print(f"best: {run.best:.1%}, {folder / 'best.pt'}; next: sim2real export {folder} -o FILE.onnx")

@@ -46,7 +46,9 @@ class JointConfig(Strict):
     kp_max: Positive  # N m/rad
     kd_max: Positive  # N m s/rad
     damping: Positive  # N m s/rad: kd while damping
+    thermometer: bool = True  # its motor reports a temperature; false: a motor that says nothing passes as cold
     group: Literal["leg", "waist", "arm", "hand", "head"]
+    reach: Literal["both", "lower", "upper"] = "both"  # stops that a hand brings it to; the body blocks the other
     source: str  # where the numbers come from, with the hardware variant
 
     @model_validator(mode="after")
@@ -240,6 +242,10 @@ class RobotConfig(Strict):
     @cached_property
     def damping(self) -> np.ndarray:
         return np.array([j.damping for j in self.joints])
+
+    @cached_property
+    def thermometer(self) -> np.ndarray:
+        return np.array([j.thermometer for j in self.joints])
 
     @cached_property
     def home_pos(self) -> np.ndarray:

@@ -70,11 +70,9 @@ class Status:
         loads = " ".join(f"{100 * x:.0f}%" for x in r["bus.load"][0])
         lost = int(r["bus.lost"].sum() + r["bus.rejected"].sum())
         table.add_row("bus load", loads, "frames lost", str(lost))
-        if hot < len(names) and strained < len(names):
-            table.add_row(
-                "hottest", f"{names[hot]} {temperature[hot]:.0f} C",
-                "most torque", f"{names[strained]} {100 * share[strained]:.0f}%",
-            )  # fmt: skip
+        if strained < len(names):
+            warm = f"{names[hot]} {temperature[hot]:.0f} C" if hot < len(names) else "not measured"
+            table.add_row("hottest", warm, "most torque", f"{names[strained]} {100 * share[strained]:.0f}%")
         fault = int(r["fault"][0])
         table.add_row("fault", Text(f"S2R-{fault:03d}", style="bold red") if fault else "none")
         rows: list[Any] = [table]
@@ -111,7 +109,8 @@ def print_summary(console: Console, summary: Any) -> None:
         row("speed", f"{summary.real_time_factor:.1f} x real time")
     row("closest to a stop", f"{summary.joint_margin_of} {summary.joint_margin:.3f} rad")
     row("most torque", f"{summary.torque_max_of} {summary.torque_max:.1f} N m ({100 * summary.torque_share:.0f}%)")
-    row("hottest", f"{summary.temperature_max_of} {summary.temperature_max:.0f} C")
+    if summary.temperature_max is not None:
+        row("hottest", f"{summary.temperature_max_of} {summary.temperature_max:.0f} C")
     row("bus load", f"{100 * summary.bus_load_max:.0f}% at most, {summary.frames_lost} frames lost")
     row("faults", ", ".join(summary.faults) or "none", "red" if summary.faults else "green")
     for refused in summary.refused_skills:

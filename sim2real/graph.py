@@ -8,7 +8,7 @@ It is no signature: to pin one particular file, compare ``load_policy(..., sha25
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from sim2real.contract import METADATA_KEY
@@ -92,6 +92,20 @@ def seal(model: ModelProto) -> bytes:
     blank = model.SerializeToString(deterministic=True)
     onnx.helper.set_model_props(model, {**kept, SEAL_KEY: hashlib.sha256(blank).hexdigest()})
     return model.SerializeToString(deterministic=True)
+
+
+def sealed_constant(name: str, values: Sequence[float], found: dict[str, str]) -> bytes:
+    """The bytes of a policy file with no input, whose one output ``name`` (1, n) is always ``values`` (n,). ``found``: its
+    metadata."""
+    import onnx
+
+    make, shape, kind = onnx.helper, [1, len(values)], onnx.TensorProto.FLOAT
+    output = make.make_tensor_value_info(name, kind, shape)
+    tensor = make.make_tensor("values", kind, shape, values)
+    graph = make.make_graph([make.make_node("Identity", ["values"], [name])], name, [], [output], [tensor])
+    model = make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=8)
+    make.set_model_props(model, found)
+    return seal(model)
 
 
 def _check_seal(data: bytes, found: dict[str, str], where: str) -> None:

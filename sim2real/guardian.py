@@ -16,13 +16,15 @@ import numpy as np
 from drivers.budget import budget
 from drivers.bus import BusError
 from drivers.wire import WireError
+from sim2real.calibration import load_calibration
 from sim2real.channel import Channel
 from sim2real.clock import MonotonicClock, SimClock
+from sim2real.preflight import Preflight
 from sim2real.records import Calls, Layout, command_fields, command_view, layout, state_view, tick_layout
 from sim2real.robot import Robot, open_robot
 from sim2real.run import Life, RunSpec, channel, keep_time, sink, tell
 from sim2real.safety import Limits, Safety
-from sim2real.types import JointCommand, Mode
+from sim2real.types import JointCommand, Mode, Sim2realError
 
 TICK, PILOT = 0, 1  # topics of a record
 
@@ -64,6 +66,7 @@ class Guardian:
     # replies are still back before the next.
     response_share = 0.35
     enable_time = 0.3  # s for every motor to answer that it is enabled
+    restart_time = 0.2  # s of silence in which a motor may have been without power, and lost what connecting programmed
     damp_time = 1.5  # s of damping at the end of a run before the motors are switched off
 
     def __init__(
@@ -90,6 +93,7 @@ class Guardian:
         self._wish = command_view(requests.record, "command")
         self._enabling: float | None = None  # since when
         self._arm_seen = False
+        self._lost = np.zeros(len(robot.config.joint_names), bool)  # were silent so long since connecting
         self._ending: float | None = None
         self._told_fault: object = None
         self._told_error = ""
@@ -111,6 +115,7 @@ class Guardian:
         self._failed = Calls(0)
         self._guard(lambda: self.robot.read(start, self._state), Calls.STOP)
         r["time"], r["tick"], r["late"], r["timing.lateness"] = scheduled, self._tick, late, lateness
+        self._lost |= np.isfinite(self._state.joint_age) & (self._state.joint_age > self.restart_time)
         r["state.time"], r["state.imu_age"] = self._state.time, self._state.imu_age
         r["timing.read"] = self.clock.now() - start
         self.states.write(r)
@@ -159,7 +164,13 @@ class Guardian:
             calls |= Calls.STOP
         arm = bool(wish["arm"]) and self._ending is None and not wish["stop"]
         if arm and not self._arm_seen and self.safety.mode != Mode.RUN:
-            if now - self._wish.time < self.safety.limits.command_age_hold:
+            if self._lost.any():
+                names = ", ".join(self.robot.config.joint_names[i] for i in np.flatnonzero(self._lost))
+                self.tell(
+                    f"not armed: {names} silent for {self.restart_time:g} s or more since connecting; a motor that lost its "
+                    "power lost its watchdog too. End this run and start another, which proves everything anew"
+                )
+            elif now - self._wish.time < self.safety.limits.command_age_hold:
                 self._enabling = now
             else:
                 self.tell("not armed: the pilot sends no commands; see its messages, then arm again")
@@ -259,8 +270,12 @@ def main(directory: Path) -> int:
     clock = MonotonicClock()
     try:
         robot = open_robot(config, wiring, simulated_in=str(directory) if spec.simulated else None)
-        robot.connect(clock)
-    except (BusError, WireError) as error:
+        if spec.simulated:
+            robot.connect(clock)
+        else:
+            calibration = load_calibration(spec.calibration) if spec.calibration else None
+            Preflight(config, spec.wiring, wiring, robot, clock, calibration, spec.variants, tell).run()
+    except (BusError, WireError, Sim2realError) as error:
         tell(str(error), failed=True)
         return 2
     guardian = Guardian(

@@ -67,15 +67,15 @@ class Child:
         *lines, self._text = self._text.split(b"\n")
         return [json.loads(line) for line in lines if line.startswith(b"{")]
 
-    def ready(self, timeout: float) -> None:
-        """Wait until it says so. Raises Sim2realError with what it said instead."""
+    def ready(self, timeout: float) -> list[str]:
+        """Wait until it says so; returns what it said before. Raises Sim2realError with what it said instead."""
         clock, said = MonotonicClock(), []
         end = clock.now() + timeout
         while clock.now() < end:
             select.select([self._stdout], [], [], 0.05)
             for message in self.messages():
                 if message.get("ready"):
-                    return
+                    return said
                 if message.get("failed"):
                     raise Sim2realError(message["text"])
                 said.append(message["text"])
@@ -105,19 +105,19 @@ class Launch:
     operator: Operator
     wiring: str = ""
     simulated: bool = True
+    calibration: Path | None = None  # of real motors
     tune: bool = True
     seed: int = 0
     faults: Sequence[str] = ()
     recorder: Any = None  # a started sim2real.recorder.process.Recorder
     show: Callable[[Launch], None] = lambda launch: None
-    gantry: bool = True
+    hang: bool = False  # nobody sets the simulated robot down from its gantry
     messages: list[str] = field(default_factory=list)
     timeout: float = 10.0  # s to be armed and through the soft start, counted from the wish to arm
 
     def __post_init__(self) -> None:
         self.wiring = self.wiring or self.config.default_wiring
         self.directory = run_directory()
-        wired = self.config.wiring(self.wiring)
         inherit = self.recorder.sink.fileno() if self.recorder else -1
         self.spec = RunSpec(
             robot=str(self.config.path.absolute()),
@@ -128,7 +128,10 @@ class Launch:
             recorder=inherit,
             seed=self.seed,
             faults=list(self.faults),
+            calibration=str(self.calibration.absolute()) if self.calibration else "",
+            variants=self._variants(),
         )
+        wired = self.wired = self.spec.open()[1]
         self.spec.save(self.directory)
         self.states = channel(
             self.directory, "tick", tick_layout(self.config.joint_names, [b.name for b in wired.buses])
@@ -175,13 +178,24 @@ class Launch:
         self._robot().close()  # rehearses the last will: everything is imported, every wire is there
         guardian = self._child("guardian", "sim2real.guardian")
         pilot = self._child("pilot", "sim2real.pilot")
-        guardian.ready(20.0)
+        said = guardian.ready(30.0)  # a real robot's motors are put to the proof meanwhile
+        self.messages += [f"guardian: {text}" for text in said if not text.startswith("tuned")]
         pilot.ready(30.0)
         self._heir.start()
 
     def _robot(self) -> Robot:
         directory = str(self.directory) if self.simulated else None
-        return open_robot(self.config, self.config.wiring(self.wiring), simulated_in=directory)
+        return open_robot(self.config, self.wired, simulated_in=directory)
+
+    def _variants(self) -> tuple[int, ...]:
+        """Of the hardware: those that the robot's limits and every policy are for; empty: nobody says."""
+        named = [
+            set(said) for said in (self.config.variants, *(p.contract.variants for p in self.player.policies)) if said
+        ]
+        if named and not set.intersection(*named):
+            listed = " and ".join(str(sorted(said)) for said in named)
+            raise Sim2realError(f"hardware variants: got {listed} of robot and policies, expected one in all of them")
+        return tuple(sorted(set.intersection(*named))) if named else ()
 
     def _child(self, name: str, module: str) -> Child:
         child = self.children[name] = Child(module, self.directory, [] if name == "world" else self._inherit)
@@ -193,7 +207,7 @@ class Launch:
         running: float | None = None
         asked: float | None = None
         guardian = self.children["guardian"].process
-        hanging = self.gantry
+        hanging = not self.hang
         n = 0
         while guardian.poll() is None:
             schedule.wait()

@@ -50,6 +50,11 @@ class Robot:
         for bus in self.buses:
             bus.connect(clock)
 
+    def shift(self, joint_pos: np.ndarray) -> None:
+        """From now on every joint is ``joint_pos`` (n,) rad further than it said so far: turns that its motor lost."""
+        self._offset = self._offset - self._sign * joint_pos
+        self._motor_offset = self._motor_offset - self._motor_sign * joint_pos[self._joint_of_motor]
+
     def read(self, now: float, state: RobotState) -> None:
         """Take in everything that arrived and fill ``state`` in place.
 

@@ -17,6 +17,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from sim2real.calibration import load_calibration
 from sim2real.channel import Channel
 from sim2real.clock import MonotonicClock, Schedule, tune
 from sim2real.config import RobotConfig, Strict, Wiring, load_robot
@@ -35,6 +36,8 @@ class RunSpec(Strict):
     recorder: int = -1  # file descriptor of the recorder's channel, inherited; -1: no record
     seed: int = 0
     faults: list[str] = []
+    calibration: str = ""  # path of the file; "": signs and offsets are the wiring's own
+    variants: tuple[int, ...] = ()  # hardware variants that robot and policies allow; empty: any
 
     def save(self, directory: Path) -> None:
         (directory / "run.json").write_text(self.model_dump_json(indent=1))
@@ -44,8 +47,10 @@ class RunSpec(Strict):
         return cls.model_validate_json((directory / "run.json").read_text())
 
     def open(self) -> tuple[RobotConfig, Wiring]:
+        """The robot, and its wiring as calibrated. Raises ConfigError, or Sim2realError for the calibration."""
         config = load_robot(self.robot)
-        return config, config.wiring(self.wiring)
+        wiring = config.wiring(self.wiring)
+        return config, load_calibration(self.calibration).applied_to(wiring) if self.calibration else wiring
 
 
 def sink(spec: RunSpec) -> Sink | None:

@@ -41,7 +41,8 @@ class Scene:
     faults: Sequence[str] = ()
     prepare: Callable | None = None
     pushes: Sequence[tuple[float, tuple[float, float, float]]] = ()
-    gantry: bool = True
+    gantry: bool = True  # it begins hanging; False: standing
+    hang: bool = False  # and nobody sets it down
     noise: float = 0.02  # rad, uniform, on the joints it starts from
     timestep: float = 0.002  # s
 
@@ -114,7 +115,7 @@ class Simulation:
         began = self.clock.now()
         running: float | None = None
         pushes = list(self.scene.pushes)
-        hanging = self.scene.gantry
+        hanging = self.scene.gantry and not self.scene.hang
         while not self.guardian.done:
             due = self.schedule.wait()
             now = self.clock.now()

@@ -39,7 +39,7 @@ class Summary:
     torque_max: float = 0.0
     torque_max_of: str = ""
     torque_share: float = 0.0  # of that joint's limit
-    temperature_max: float = 0.0
+    temperature_max: float | None = None  # deg C; None: no motor reports any
     temperature_max_of: str = ""
     bus_load_max: float = 0.0
     frames_lost: int = 0
@@ -61,7 +61,7 @@ class Measures:
         n = len(config.joint_names)
         self._margin = np.full(n, np.inf)
         self._torque = np.zeros(n)
-        self._temperature = np.zeros(n)
+        self._temperature = np.full(n, -np.inf)
         self._load = np.zeros(len(wiring.buses))
         self._faults: list[str] = []
         self._fault = 0
@@ -114,6 +114,7 @@ class Measures:
             int(np.argmax(self._torque)),
             int(np.argmax(self._temperature)),
         )
+        measured = bool(np.isfinite(self._temperature[hot]))
         out = Summary(
             robot=self._config.name,
             duration=self._since,
@@ -129,8 +130,8 @@ class Measures:
             torque_max=float(self._torque[torque]),
             torque_max_of=names[torque],
             torque_share=float(self._torque[torque] / self._config.torque_max[torque]),
-            temperature_max=float(self._temperature[hot]),
-            temperature_max_of=names[hot],
+            temperature_max=float(self._temperature[hot]) if measured else None,
+            temperature_max_of=names[hot] if measured else "",
             bus_load_max=float(self._load.max()),
             frames_lost=self._last.get("lost", 0),
             **more,

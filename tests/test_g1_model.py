@@ -1,4 +1,4 @@
-"""The G1 body against the maker's description, link by link and joint by joint, and against the robot file."""
+"""The G1 body against the maker's description, link by link and joint by joint. What every robot must get right: test_models.py."""
 
 from __future__ import annotations
 
@@ -36,15 +36,8 @@ def joints(model: mujoco.MjModel) -> list[str]:
     return [model.joint(i).name for i in range(model.njnt)]
 
 
-def test_no_shape_carries_mass_and_no_file_is_needed(model: mujoco.MjModel) -> None:
-    assert model.nmesh == 0
+def test_no_shape_carries_mass(model: mujoco.MjModel) -> None:
     assert model.body_mass.sum() == pytest.approx(33.341142, abs=1e-6)
-
-
-def test_order_is_the_robot_file_s(model: mujoco.MjModel) -> None:
-    assert joints(model) == ["floating_base_joint", *ROBOT.joint_names]
-    assert [model.actuator(i).name for i in range(model.nu)] == list(ROBOT.joint_names)
-    assert [model.actuator_trnid[i, 0] for i in range(model.nu)] == list(range(1, model.njnt))
 
 
 @needs_reference
@@ -87,13 +80,6 @@ def test_forward_kinematics_agree_to_a_millimetre(model: mujoco.MjModel, referen
         np.testing.assert_allclose(ours.xipos, theirs.xipos, atol=1e-3)
 
 
-def test_the_robot_file_asks_for_no_more_than_the_body_has(model: mujoco.MjModel) -> None:
-    low, high = model.jnt_range[1:].T
-    assert np.all(low - 1e-6 <= ROBOT.position_min) and np.all(ROBOT.position_max <= high + 1e-6)
-    np.testing.assert_array_less(ROBOT.torque_max - 1e-6, model.actuator_ctrlrange[:, 1])
-    np.testing.assert_array_equal(model.actuator_ctrlrange, model.jnt_actfrcrange[1:])
-
-
 def test_home_stands_with_flat_feet(model: mujoco.MjModel) -> None:
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("home").id)
@@ -109,12 +95,3 @@ def test_home_stands_with_flat_feet(model: mujoco.MjModel) -> None:
 def test_what_could_collide_does(model: mujoco.MjModel, left: str, right: str) -> None:
     a, b = model.geom(left), model.geom(right)
     assert (int(a.contype[0]) & int(b.conaffinity[0])) | (int(b.contype[0]) & int(a.conaffinity[0]))
-
-
-def test_a_fallen_robot_lies_on_the_floor(model: mujoco.MjModel) -> None:
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    for _ in range(1500):  # 3 s limp
-        mujoco.mj_step(model, data)
-    assert data.xpos[1:, 2].min() > 0.0
-    assert data.xpos[1:, 2].max() < 0.6

@@ -17,6 +17,7 @@ by four independent libraries (cmjang/DM_Control_Python, enactic/openarm_can, ji
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -93,6 +94,8 @@ REGISTERS: dict[str, tuple[int, str, bool]] = {
     "P_M": (80, "<f4", False),
     "XOUT": (81, "<f4", False),
 }
+BIT_RATES = {0: 125_000, 1: 200_000, 2: 250_000, 3: 500_000, 4: 1_000_000, 5: 2_000_000, 6: 2_500_000, 7: 3_200_000,
+             8: 4_000_000, 9: 5_000_000}  # of CAN_BR; from 5 on CAN FD  # fmt: skip
 REGISTER_NAMES = {number: name for name, (number, _, _) in REGISTERS.items()}
 
 
@@ -200,6 +203,8 @@ class DamiaoCodec:
     # Bits of one command and its answer on the wire, inter-frame space included: the mean of MIT traffic, and the most
     # that bit stuffing makes of twice 8 bytes with an 11-bit identifier.
     TICK_BITS = (117.6 + 115.0, 135.0 + 135.0)
+    IDENTITY = ("SN",)
+    TURN = 2 * np.pi  # single-turn absolute encoder at the output
 
     def __init__(self, spec: BusSpec) -> None:
         """Raises BusError for an unknown model, or identifiers by which the motors could not be told apart."""
@@ -344,12 +349,16 @@ def _check_ids(spec: BusSpec) -> None:
 class DamiaoMotors:
     """The motors' side: what emulated motors do with the frames of a host, and the frames that they answer with."""
 
-    def __init__(self, spec: BusSpec, ranges: Ranges | None = None) -> None:
-        """``ranges``: what registers 21 to 23 hold, where they are not the models' own."""
+    def __init__(self, spec: BusSpec, ranges: Ranges | None = None, hears: Sequence[bool] | None = None) -> None:
+        """``ranges``: what registers 21 to 23 hold, where they are not the models' own. ``hears``: which motors do."""
         self.mit = MitCodec(ranges or ranges_of(spec.motors))
         self.ids = np.array([m.id for m in spec.motors], np.uint32)
         self.feedback_ids = np.array([m.feedback_id for m in spec.motors], np.uint32)
         self._row_of = _row_of(self.ids)
+        if hears is not None:
+            self._row_of[self.ids] = -1
+            listening = np.flatnonzero(hears)
+            self._row_of[self.ids[listening]] = listening
 
     def classify(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whom each of ``frames`` (FRAME, (m,)) is for, and its Kind: (m,) int64 rows of the motors, -1 for none of

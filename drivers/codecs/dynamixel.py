@@ -12,6 +12,11 @@ Framing, stuffing and CRC are in dynamixel_packet.py. Source: ROBOTIS e-manual, 
   back-EMF, ``damping_of(model)``, whether asked for or not, also at kp = 0: the windings are then shorted.
 - the terms ``kd * velocity + torque`` move the goal position by themselves over kp, which gives the same torque.
 
+Profiles are switched off, so that targets are not smoothed. There is no current loop in these modes: CURRENT_LIMIT and
+GOAL_CURRENT do nothing, and torque ends with the duty cycle, at the stall torque or at PWM_LIMIT where that is lower.
+A policy for such a robot is trained with kd = ``damping_of(model)``; the robot's YAML says the same for kd, kd_max and
+damping (configs/robots/op3.yaml).
+
 Operating modes 3 (position, one turn) and 4 (extended position) work so. Mode 5 (current-based position) is refused: how
 its P gain relates to current is not published.
 """
@@ -240,6 +245,8 @@ class DynamixelCodec:
         10.0 * (GOAL_ITEM.itemsize + 1 + STATUS.itemsize + 6),
     )
     TICK_OVERHEAD_BITS = 10.0 * 2 * (OVERHEAD + 4)
+    IDENTITY = ("MODEL", "FIRMWARE")  # there is no serial number: a servo of the same make passes for another
+    TURN = 2 * np.pi
     ERROR_REGISTER = "HARDWARE_ERROR"
     HAS_FAST_READ = True
 

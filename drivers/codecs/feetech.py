@@ -63,6 +63,7 @@ class Model(NamedTuple):
 MODELS = {"STS3215-7V4": Model(777, 1.91), "STS3215-12V": Model(777, 2.94)}  # 19.5 and 30 kg cm, maker's data sheets
 
 REGISTERS: dict[str, tuple[int, int]] = {  # address, size
+    "FIRMWARE": (0, 2),  # major, minor
     "MODEL": (3, 2),
     "ID": (5, 1),
     "BAUD": (6, 1),
@@ -110,6 +111,7 @@ STATE = np.dtype(
         "itemsize": 26,
     }
 )
+BAUD_RATES = {0: 1_000_000, 1: 500_000, 2: 250_000, 3: 128_000, 4: 115_200, 5: 76_800, 6: 57_600, 7: 38_400}
 ERRORS = {0x01: "voltage", 0x02: "encoder", 0x04: "overheating", 0x08: "current", 0x20: "overload"}
 
 
@@ -213,6 +215,8 @@ class FeetechCodec:
     _ANSWER = 6 + STATE.itemsize  # bytes
     TICK_BITS = (10.0 * (GOAL.itemsize + 1 + _ANSWER),) * 2
     TICK_OVERHEAD_BITS = 10.0 * 2 * 8
+    IDENTITY = ("MODEL",)  # there is no serial number
+    TURN = 2 * np.pi
     ERROR_REGISTER = ""  # errors last as long as their cause
     HAS_FAST_READ = False
 

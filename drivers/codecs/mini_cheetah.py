@@ -67,6 +67,8 @@ class MiniCheetahCodec:
     MASTER: ClassVar[int] = 0  # identifier of answers where the wiring says 0
     LENGTHS: ClassVar[tuple[int, ...]] = (6, 7, 8)  # of answers; by firmware
     TICK_BITS = (117.6 + 115.0, 135.0 + 135.0)  # of a command and an answer of 8 bytes, as Damiao's; others are shorter
+    IDENTITY = ()
+    TURN = 0.0  # where it starts to count after power-on is the build's own affair
 
     def __init__(self, spec: BusSpec) -> None:
         """Raises BusError for an unknown model, or identifiers by which the motors could not be told apart."""

@@ -46,9 +46,12 @@ from drivers.codecs.moteus_frame import (
     REPLY,
     WRITE,
     Register,
+    Resolution,
     console,
     pad,
+    serial_number,
     subframes,
+    varuint,
 )
 from drivers.codecs.robstride import model_of
 from drivers.wire import ERROR, EXTENDED, REMOTE, make_fd_frames
@@ -134,6 +137,9 @@ ANSWER_HEADS = {
     "state_head": (REPLY | 2, Register.TEMPERATURE),
 }
 STOP = bytes([WRITE | 1, Register.MODE, Mode.STOPPED, *QUESTIONS])  # 9 bytes: padded to 12
+SERIAL = "serial_number"  # no name of the configuration: registers 120 to 122
+ASK_SERIAL = bytes([READ | Resolution.INT32 << 2 | 3]) + varuint(Register.SERIAL_NUMBER)
+ASK_FIRMWARE = bytes([READ | Resolution.INT32 << 2 | 1]) + varuint(Register.FIRMWARE)
 HEARING = bytes([CONSOLE_READ, CONSOLE, CONSOLE_MAX])
 
 
@@ -166,6 +172,12 @@ def identifier(source: int, destination: int, reply: bool = False) -> int:
     """16 bits, with EXTENDED where a standard frame cannot hold them."""
     id = source << 8 | destination | REPLY_WANTED * reply
     return id | EXTENDED if id > 0x7FF else id
+
+
+def pack_question(id: int, payload: bytes) -> np.ndarray:
+    """FD_FRAME (1,) to controller ``id``, which answers."""
+    data = np.frombuffer(pad(payload), np.uint8)
+    return make_fd_frames(np.array([identifier(HOST, id, reply=True)], np.uint32), data[None], len(data))
 
 
 def pack_command(command: MotorCommand, gains: Gains, timeout: float) -> np.ndarray:
@@ -241,6 +253,8 @@ class MoteusCodec:
     # A command of 48 bytes and an answer of 24, in bits at 1 Mbit/s: random motion of a motor whose answers are extended
     # frames (id above 7; else 22 bits less), and the most that stuffing can make of them (one for every four bits).
     TICK_BITS = (244.0, 271.6)
+    IDENTITY = (SERIAL,)
+    TURN = 2 * np.pi / 6  # of the output, in one turn of the rotor, whose encoder is all that there is; of all MODELS
 
     def __init__(self, spec: BusSpec) -> None:
         """Raises BusError for an unknown model, an id that cannot be, or a bus without CAN-FD."""
@@ -252,7 +266,7 @@ class MoteusCodec:
             )
         models = [model_of(m, MODELS, "moteus.py") for m in spec.motors]
         n = len(models)
-        self._gains, self._timeout = gains_of(spec), spec.watchdog
+        self._spec, self._gains, self._timeout = spec, gains_of(spec), spec.watchdog
         ids = [m.id for m in spec.motors]
         self._ids = np.array([identifier(HOST, id, reply=True) for id in ids], np.uint32)
         self._silent_ids = np.array([identifier(HOST, id) for id in ids], np.uint32)
@@ -306,13 +320,15 @@ class MoteusCodec:
         return self._frames(bytes(QUESTIONS))
 
     def pack_register(self, row: int, register: str, value: float | int | None = None) -> np.ndarray:
-        """Write a configuration value, or ask for it and fetch what the console has to say.
+        """Write a configuration value, or ask for it and fetch what the console has to say; or ask for SERIAL.
 
         The console's answers do not tell what they answer, so that only one question is out at a time: it is put again
         when its answer was fetched twice and did not come, and before that only fetched.
         """
         if value is not None:
             return self._type(row, f"conf set {register} {value:.9g}\n")
+        if register == SERIAL:
+            return pack_question(self._spec.motors[row].id, ASK_SERIAL)
         asked, fetched = self._asked[row]
         fetch = make_fd_frames(self._ids[row : row + 1], np.frombuffer(HEARING, np.uint8)[None], len(HEARING))
         if asked == register and fetched < 2:
@@ -326,11 +342,15 @@ class MoteusCodec:
         return make_fd_frames(self._silent_ids[row : row + 1], payload[None], len(payload))
 
     def unpack_registers(self, frames: np.ndarray) -> list[RegisterAnswer]:
-        """What the consoles said of what was asked for. OK confirms a write; ERR stands for a value that there is not."""
+        """What the consoles said of what was asked for, and serial numbers. OK confirms a write; ERR stands for a value
+        that there is not."""
         answers = []
         rows = self.owners(frames)
         for frame, row in zip(frames[rows >= 0], rows[rows >= 0].tolist(), strict=True):
-            for text in _console_texts(frame["data"][: frame["length"]].tobytes()):
+            payload = frame["data"][: frame["length"]].tobytes()
+            if (serial := _serial_number(payload)) is not None:
+                answers.append(RegisterAnswer(row, SERIAL, serial, False))
+            for text in _console_texts(payload):
                 *lines, self._said[row] = (self._said[row] + text)[-1024:].split(b"\n")
                 for line in lines:
                     register = self._asked[row][0]
@@ -369,9 +389,14 @@ class MoteusCodec:
         return rows
 
     def error_name(self, code: int) -> str:
-        if code in FAULTS or not code:
-            return FAULTS.get(code, "none")
-        return "limited" if 96 <= code <= 103 else f"unknown fault {code}"
+        return fault_name(code)
+
+
+def fault_name(code: int) -> str:
+    """The maker's name of register 00F, or of TIMED_OUT."""
+    if code in FAULTS or not code:
+        return FAULTS.get(code, "none")
+    return "limited" if 96 <= code <= 103 else f"unknown fault {code}"
 
 
 def _check_ids(spec: BusSpec) -> None:
@@ -383,6 +408,13 @@ def _check_ids(spec: BusSpec) -> None:
             raise BusError(
                 f"{where} (id {m.id:#x}): got feedback_id {m.feedback_id:#x}, expected none: it answers to who asked"
             )
+
+
+def _serial_number(payload: bytes) -> int | None:
+    try:
+        return serial_number(payload)
+    except ValueError:
+        return None
 
 
 def _console_texts(payload: bytes) -> list[bytes]:

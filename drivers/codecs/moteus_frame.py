@@ -85,6 +85,8 @@ class Register(IntEnum):
     COMMAND_TIMEOUT = 0x027
     COMMAND_VELOCITY_LIMIT = 0x028
     COMMAND_ACCELERATION_LIMIT = 0x029
+    FIRMWARE = 0x101  # a byte each of major, minor, micro
+    SERIAL_NUMBER = 0x120  # 96 bits in three registers, least significant first
 
 
 R = Register
@@ -220,6 +222,14 @@ def registers_of(payload: bytes) -> dict[int, float | None]:
             kind = KINDS.get(s.first + i, "int")
             found[s.first + i] = None if s.type == READ else from_raw(s.values[i], kind, s.resolution)
     return found
+
+
+def serial_number(payload: bytes) -> int | None:
+    """The 96 bits of a serial number that a payload answers; None: it answers none. Raises ValueError as ``subframes``."""
+    for s in subframes(payload):
+        if (s.type, s.first, s.count, s.resolution) == (REPLY, Register.SERIAL_NUMBER, 3, Resolution.INT32):
+            return sum((int(word) & 0xFFFF_FFFF) << 32 * i for i, word in enumerate(s.values))
+    return None
 
 
 def console(type: int, text: bytes) -> bytes:

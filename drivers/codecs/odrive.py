@@ -170,6 +170,8 @@ class OdriveCodec:
         135.0 + 55.0 + 135.0 + (55.0 + 135.0) / 3 + 135.0 / 2,
     )
     TICK_OVERHEAD_BITS = 119.2
+    IDENTITY = ()
+    TURN = 0.0  # the count of the motor's own turns is lost, and with it the joint's zero
     MOTOR_FRAMES = 3 + 2 / 3 + 1 / 2
 
     def __init__(self, spec: BusSpec) -> None:

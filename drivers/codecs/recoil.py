@@ -203,9 +203,12 @@ class RecoilCodec:
     """The host's side of one bus (a ``can_bus.CanCodec``). It remembers which gains each device has, and what it was asked."""
 
     # Bits of RPDO2 and TPDO2 and, every third tick, of an SDO question (3 bytes) and its answer (4 bytes): means of random
-    # targets and states. For the whole bus, one gain a tick.
-    TICK_BITS = (120.5 + 115.1 + (77.0 + 84.0) / 3, 135.0 + 135.0 + (85.0 + 95.0) / 3)
+    # targets and states. For the whole bus, one gain a tick; worst, while gains move (soft start, scaled torque), both
+    # gains of every motor in each.
+    TICK_BITS = (120.5 + 115.1 + (77.0 + 84.0) / 3, 135.0 + 135.0 + (85.0 + 95.0) / 3 + 2 * 135.0)
     TICK_OVERHEAD_BITS = 120.0
+    IDENTITY = ()
+    TURN = 0.0  # the count of the motor's own turns is lost, and with it the joint's zero
     MOTOR_FRAMES = 2 + 2 / 3
 
     def __init__(self, spec: BusSpec) -> None:
@@ -412,6 +415,10 @@ class RecoilMotors:
     def pack_motion(self, row: int, function: Function, position: float, second: float) -> np.ndarray:
         """A TPDO2 or TPDO4 (rad, rad/s), or TPDO3 (rad, N m), FRAME (1,)."""
         return _frame(identifier(function, int(self.ids[row])), np.array([position, second], "<f4").tobytes())
+
+    def pack_motions(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """The TPDO2 (FRAME, (n,)) of every motor: rad, rad/s."""
+        return make_frames(identifier(Function.TPDO2, 0) | self.ids, _bytes(position, velocity))
 
     def pack_echo(self, row: int, data: np.ndarray) -> np.ndarray:
         """A TPDO1 (FRAME, (1,)): the eight bytes of the RPDO1."""

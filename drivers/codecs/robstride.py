@@ -122,6 +122,9 @@ PARAMETERS: dict[str, tuple[int, str]] = {
     "add_offset": (0x702B, "<f4"),
 }
 PARAMETER_NAMES = {index: name for name, (index, _) in PARAMETERS.items()}
+BIT_RATES = {1: 1_000_000, 2: 500_000, 3: 250_000, 4: 125_000}  # of BAUD
+UID = "MCU_UID"  # no parameter: the answer to GET_ID, 64 bits
+BROADCAST_ID = 0xFE  # to which GET_ID is answered
 SEQUENCE = bytes(range(1, 9))  # payload by which SAVE, BAUD, REPORT and PROTOCOL are meant
 
 # Bits of MotorState.error: the six of a feedback identifier, and behind them the 32 of a fault frame.
@@ -241,6 +244,8 @@ class RobstrideCodec:
 
     # Bits of OPERATION and its answer: the mean of random traffic, and the most that stuffing makes of 2 x 131 bits.
     TICK_BITS = (140.3 + 140.3, 160.0 + 160.0)
+    IDENTITY = (UID,)
+    TURN = 2 * np.pi  # from power-on it counts from -pi to pi
 
     def __init__(self, spec: BusSpec) -> None:
         """Raises BusError for an unknown model or identifiers that the protocol does not have."""
@@ -287,14 +292,19 @@ class RobstrideCodec:
 
     def pack_register(self, row: int, register: str, value: float | int | None = None) -> np.ndarray:
         """One request (FRAME, (1,)) to read a parameter of motor ``row``, or to write ``value`` to it."""
+        if register == UID:
+            return self._ask(Type.GET_ID)[row : row + 1]
         kind = Type.READ if value is None else Type.WRITE
         data = pack_parameter(register, value or 0)
         return make_frames(np.array([identifier(kind, HOST_ID, self._spec.motors[row].id)]), data[None])
 
     def unpack_registers(self, frames: np.ndarray) -> list[RegisterAnswer]:
-        """Every answer to READ among ``frames``; NaN where the motor says that it failed."""
+        """Every answer to READ and GET_ID among ``frames``; NaN where the motor says that it failed."""
         rows, types = self._sort(frames)
         found = []
+        for i in np.flatnonzero((rows >= 0) & (types == Type.GET_ID)):
+            uid = int.from_bytes(frames["data"][i].tobytes(), "little")
+            found.append(RegisterAnswer(int(rows[i]), UID, uid, False))
         for i in np.flatnonzero((rows >= 0) & (types == Type.READ)):
             parameter = unpack_parameter(frames["data"][i])
             failed = int(frames["id"][i]) >> 16 & 0xFF
@@ -329,7 +339,8 @@ class RobstrideCodec:
         ids = frames["id"].astype(np.int64)
         types = ids >> 24 & 0x1F
         rows = self._row_of[ids >> 8 & 0xFF].copy()
-        answers = np.isin(types, ANSWERS) & (ids & 0xFF == HOST_ID) & (ids >> 29 == EXTENDED >> 29)
+        listener = np.where(types == Type.GET_ID, BROADCAST_ID, HOST_ID)
+        answers = np.isin(types, ANSWERS) & (ids & 0xFF == listener) & (ids >> 29 == EXTENDED >> 29)
         rows[~answers | (frames["length"] != 8)] = -1
         return rows, types
 
@@ -338,7 +349,7 @@ class RobstrideCodec:
         return ", ".join(named) or "none"
 
 
-ANSWERS = [Type.FEEDBACK, Type.READ, Type.FAULT, Type.REPORT]
+ANSWERS = [Type.GET_ID, Type.FEEDBACK, Type.READ, Type.FAULT, Type.REPORT]
 
 
 def _checks(spec: BusSpec, torque: np.ndarray, ticks: int) -> list[RegisterCheck]:
@@ -421,6 +432,11 @@ class RobstrideMotors:
         """One motor's answer to READ (FRAME, (1,)): ``data`` (8,) as from ``pack_parameter``."""
         id = identifier(Type.READ, int(failed) << 8 | int(self.ids[row]), HOST_ID)
         return make_frames(np.array([id]), data[None])
+
+    def pack_uid(self, row: int, uid: int) -> np.ndarray:
+        """One motor's answer to GET_ID (FRAME, (1,)): the 64-bit serial of its chip."""
+        id = identifier(Type.GET_ID, int(self.ids[row]), BROADCAST_ID)
+        return make_frames(np.array([id]), np.array([uid], "<u8").view(np.uint8)[None])
 
     def pack_fault(self, row: int, faults: int, warnings: int = 0) -> np.ndarray:
         """One motor's fault frame (FRAME, (1,))."""

@@ -3,13 +3,16 @@
 On expiry of TIMEOUT the motor disables itself with error D and stays so until clear and enable; it does not damp.
 What counts as life for the watchdog is not documented: here commands and enable frames, not questions.
 
-Not modelled: control modes other than MIT (their frames are ignored, as by a motor in MIT mode), re-addressing by
-writing MST_ID or ESC_ID (remembered, without effect).
+A new ESC_ID or MST_ID is heard at once, a new CAN_BR from the next power-on; each is lost then unless it was stored.
+
+Not modelled: control modes other than MIT (their frames are ignored, as by a motor in MIT mode), two motors with one
+ESC_ID (one of them answers), error frames by a motor at another bit rate (it hears nothing).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +26,7 @@ from drivers.sim.wire import priority
 from drivers.wire import FRAME, make_frames
 
 MAGIC_PREFIX = b"\xff" * 7
+FIRST_SERIAL = 1001
 
 
 class SimDamiao(SimMotors):
@@ -31,13 +35,14 @@ class SimDamiao(SimMotors):
     def __init__(
         self, buses: Sequence[BusSpec], body: Body, frame_bits: Callable[[np.ndarray], np.ndarray], **options: Any
     ) -> None:
-        self._decoders = [damiao.DamiaoMotors(b) for b in buses]  # one for each bus: whom a frame is for
+        self._decoders: list[damiao.DamiaoMotors] = []  # one for each bus: whom a frame is for
+        self._tuned: list[int] = []  # bit rates, since power-on
         super().__init__(buses, body, frame_bits, **options)
-        self._keys = [priority(m.feedback_id) for m in self.specs]
 
     def factory(self) -> list[dict[str, float]]:
         ranges = damiao.ranges_of(self.specs)
-        return [_factory_registers(m, ranges, i) for i, m in enumerate(self.specs)]
+        rates = [b.bitrate for b in self._bus_specs for _ in b.motors]
+        return [_factory_registers(m, ranges, i, rates[i]) for i, m in enumerate(self.specs)]
 
     def addressee(self, bus: int, id: int, raw: bytes) -> int:
         return self._rows[bus].get(raw[8] | raw[9] << 8 if id == damiao.BROADCAST_ID else id, -1)
@@ -58,7 +63,7 @@ class SimDamiao(SimMotors):
         frame = np.frombuffer(raw, FRAME)
         rows, kinds = self._decoders[bus].classify(frame)
         row, kind = int(rows[0]) + self._first[bus], int(kinds[0])
-        if rows[0] < 0 or not self.powered[row] or kind in (Kind.COMMAND, Kind.OTHER_MODE):
+        if rows[0] < 0 or not self._hears(bus, row) or kind in (Kind.COMMAND, Kind.OTHER_MODE):
             return None
         self._take_commands()  # what came before counts before
         if kind == Kind.REGISTER:
@@ -106,6 +111,13 @@ class SimDamiao(SimMotors):
         )
         return self._say(row, frame)
 
+    def _hears(self, bus: int, row: int) -> bool:
+        return self._rows[bus].get(self.specs[row].id) == row
+
+    def _boot(self, row: int) -> None:
+        super()._boot(row)
+        self._tuned[row] = damiao.BIT_RATES.get(int(self._registers[row]["CAN_BR"]), 0)
+
     def _pack_feedback(self) -> np.ndarray:
         return self._codec.pack_feedback(
             self.position,
@@ -138,6 +150,17 @@ class SimDamiao(SimMotors):
         ranges = Ranges(
             column("PMAX"), column("VMAX"), column("TMAX"), np.full(n, damiao.KP_MAX), np.full(n, damiao.KD_MAX)
         )
+        self._tuned = self._tuned or [damiao.BIT_RATES.get(int(rate), 0) for rate in column("CAN_BR")]
+        self._listen(list(zip(column("ESC_ID").astype(int), column("MST_ID").astype(int), strict=True)), self._tuned)
+        self._keys = [priority(m.feedback_id) for m in self.specs]
+        self._decoders = []
+        for bus, (first, b) in enumerate(zip(self._first, self._bus_specs, strict=True)):
+            own = self.specs[first : first + len(b.motors)]
+            self._decoders.append(
+                damiao.DamiaoMotors(
+                    replace(b, motors=own), hears=[self._hears(bus, first + k) for k in range(len(own))]
+                )
+            )
         self._codec = damiao.DamiaoMotors(self._all, ranges)
         self._rated = RATED_SHARE * ranges.torque
         self._rotor_limit = column("OT_VALUE")
@@ -151,14 +174,15 @@ class SimDamiao(SimMotors):
         self._set_deadline()
 
 
-def _factory_registers(spec, ranges: Ranges, row: int) -> dict[str, float | int]:
+def _factory_registers(spec, ranges: Ranges, row: int, bitrate: int) -> dict[str, float | int]:
     registers: dict[str, float | int] = {name: 0 for name in damiao.REGISTERS}
     registers |= {
         "ESC_ID": spec.id,
         "MST_ID": spec.feedback_id,
         "CTRL_MODE": damiao.MIT_MODE,
         "TIMEOUT": 0,
-        "CAN_BR": 4,
+        "CAN_BR": next((code for code, rate in damiao.BIT_RATES.items() if rate == bitrate), 4),
+        "SN": FIRST_SERIAL + row,
         "OT_VALUE": ROTOR_LIMIT,
         "PMAX": float(ranges.position[row]),
         "VMAX": float(ranges.velocity[row]),

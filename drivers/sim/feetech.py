@@ -7,8 +7,8 @@ other side. There is no watchdog.
 
 The law: the maker publishes no unit of its gains. Here full duty at P = 32 stands for 128 counts (11 degrees) of error, and
 duty and back-EMF make torque as in any brushed motor, down to none at NO_LOAD_SPEED. For 12 V that is 15 N m/rad and
-0.62 N m s/rad. Not modelled: D, I, dead band, minimum force, speed and acceleration limits of a move, step mode, changes of
-bit rate, supply voltage, backlash.
+0.62 N m s/rad. Not modelled: D, I, dead band, minimum force, speed and acceleration limits of a move, step mode, supply
+voltage, backlash, two servos with one id (one of them answers). A new id and a new bit rate are heard at once.
 
 Source: Feetech, memory table of STS servos with magnetic encoder; what is not in it, by the maker's SCServo library.
 """
@@ -51,6 +51,7 @@ POSITION_MODE, VELOCITY_MODE, PWM_MODE = 0, 1, 2
 VELOCITY_STIFFNESS = 10.0  # times the back-EMF
 VOLTAGE = {"7V4": 74}  # 0.1 V, by the end of a model's name; else 12 V
 FACTORY = {
+    "FIRMWARE": 9 << 8 | 3,  # 3.9
     "RESPONSE_LEVEL": 1,
     "POSITION_MAX": TICKS - 1,
     "TEMPERATURE_LIMIT": 70,
@@ -73,6 +74,8 @@ class SimFeetech(TableServos):
     answers all the same; else it never does (which of the two it is, is not published). ``fast``: they know none.
     """
 
+    BAUD_RATES = feetech.BAUD_RATES
+
     def __init__(
         self,
         spec: BusSpec,
@@ -88,7 +91,8 @@ class SimFeetech(TableServos):
         self._patient = patient
         self._volts = [VOLTAGE.get(m.model.rpartition("-")[2], 120) for m in spec.motors]
         for row, (motor, model) in enumerate(zip(spec.motors, models, strict=True)):
-            for name, value in (FACTORY | {"MODEL": model.number, "ID": motor.id}).items():
+            own = {"MODEL": model.number, "ID": motor.id, "BAUD": self._baud(0)}
+            for name, value in (FACTORY | own).items():
                 self._set(row, name, value)
         for joint, changes in (registers or {}).items():
             if joint not in self.joints:
@@ -96,6 +100,7 @@ class SimFeetech(TableServos):
             for name, value in changes.items():
                 self._set(self.joints.index(joint), name, value)
         self._kept = self._table.copy()  # what a power cycle leaves
+        self._readdress()
         self._overloaded = np.full(len(models), np.inf)  # s, since when; inf: is not
         self._side = np.zeros(len(models))  # of the goal, when the protection set in; 0: it has not
         self._turn = np.zeros(len(models))  # of the shaft, by which a position is less
@@ -196,7 +201,7 @@ class SimFeetech(TableServos):
             self._set(row, "TORQUE_ENABLE", before)
         elif bool(torque) != bool(before):
             self._switch(row, bool(torque), time, "enabled" if torque else "disabled")
-        self.row_of = {self._get(k, "ID"): k for k in range(len(self.joints))}
+        self._readdress()
         if self._side[row] and np.sign(self._error(row)) != self._side[row]:
             self._side[row] = 0.0
             self._set(row, "STATUS", self._get(row, "STATUS") & ~OVERLOAD)
@@ -255,8 +260,12 @@ class SimFeetech(TableServos):
                 self._note(now, row, "overload")
                 self._changed = True
 
+    @property
+    def enabled(self) -> np.ndarray:
+        return (self._column("TORQUE_ENABLE") == 1) & np.array(self.powered)
+
     def _decide(self) -> np.ndarray:
-        on = (self._column("TORQUE_ENABLE") == 1) * np.array(self.powered)
+        on = self.enabled
         mode, limit = self._column("MODE"), self._column("TORQUE_LIMIT")
         limit = np.minimum(limit, self._column("TORQUE_MAX")) / TORQUE_FULL
         limit = np.where(self._side != 0, np.minimum(limit, self._column("PROTECTIVE_TORQUE") / 100), limit)
@@ -287,7 +296,6 @@ class SimFeetech(TableServos):
         self._booting[row] = time + self.BOOT_TIME
         self._registered.pop(row, None)
         self._side[row], self._overloaded[row] = 0.0, np.inf
-        self.row_of = {self._get(k, "ID"): k for k in range(len(self.joints))}
         self._switch(row, False, time, event)
 
     def _switch(self, row: int, on: bool, time: float, event: str) -> None:

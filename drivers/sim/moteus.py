@@ -46,6 +46,8 @@ from drivers.wire import ERROR, EXTENDED, REMOTE
 
 SHORTED_DAMPING = 0.5  # N m s/rad at the output, of the right size, not measured
 BUS_VOLTAGE = 24.0
+FIRST_SERIAL = 0x0000_4D54, 0x2034_5005, 0x002A_0000  # of the first motor, low word first; then they count up
+FIRMWARE = 0x01_03_04
 PAYLOAD = 8  # where it begins in a raw frame
 PAYLOAD_MAX = 64
 OVER_TEMPERATURE, OUTSIDE_LIMIT = 38, 39  # register 00F
@@ -166,6 +168,8 @@ class SimMoteus(SimMotors):
             Register.COMMAND_KP_SCALE: command[KP],
             Register.COMMAND_KD_SCALE: command[KD],
             Register.COMMAND_MAX_TORQUE: command[MOST],
+            Register.FIRMWARE: FIRMWARE,
+            **{Register.SERIAL_NUMBER + i: word + row * (not i) for i, word in enumerate(FIRST_SERIAL)},
         }
 
     # -- commands ----------------------------------------------------------------------------------------------------

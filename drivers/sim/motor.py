@@ -93,6 +93,8 @@ class SimMotors:
         self.specs = tuple(m for b in buses for m in b.motors)
         self.joints = [m.joint for m in self.specs]
         self.bus_names = [b.name for b in buses for _ in b.motors]
+        self._bus_specs = list(buses)
+        self._bitrates = [b.bitrate for b in buses]  # at which the hosts talk now
         n = len(self.specs)
         self._body, self._frame_bits, self._wrap = body, frame_bits, wrap
         self._bus_of = np.repeat(np.arange(len(buses)), [len(b.motors) for b in buses])
@@ -296,7 +298,26 @@ class SimMotors:
             self.error[row] = 0
             self._registers[row] = dict(self._flash[row])
             self._boot(row)
-            self._configure()
+        self._configure()
+
+    def retune(self, bus: int, bitrate: int) -> None:
+        """The host of a bus now talks at ``bitrate``: who listens at another hears nothing."""
+        self._bitrates[bus] = bitrate
+        self._configure()
+
+    def _listen(self, addresses: Sequence[tuple[int, int]], bitrates: Sequence[int]) -> None:
+        """From now on motors listen to these identifiers and answer on those, at their bit rates. One that is without power
+        or at another bit rate than its bus hears nothing; of two with one identifier, one."""
+        self.specs = tuple(
+            replace(m, id=id, feedback_id=feedback) for m, (id, feedback) in zip(self.specs, addresses, strict=True)
+        )
+        self._all = replace(self._all, motors=self.specs)
+        hears = [self.powered[row] and rate == self._bitrates[bus]
+                 for row, (bus, rate) in enumerate(zip(self._bus_of.tolist(), bitrates, strict=True))]  # fmt: skip
+        self._rows = [
+            {self.specs[row].id: row for row in range(first, first + len(b.motors)) if hears[row]}
+            for first, b in zip(self._first, self._bus_specs, strict=True)
+        ]
 
     def register(self, joint: str, name: str) -> float:
         """What a motor's register holds."""

@@ -54,7 +54,7 @@ class Plant:
         self.data = data = mujoco.MjData(model)
         self.joints = tuple(joints)
         self.timestep = timestep
-        ids = np.array([model.joint(name).id for name in joints])
+        ids = self._joint_ids = np.array([model.joint(name).id for name in joints])
         self._qpos_at, self._qvel_at = model.jnt_qposadr[ids], model.jnt_dofadr[ids]
         self._base = model.body(base).id
         first = model.body_jntadr[self._base]
@@ -103,6 +103,15 @@ class Plant:
         self._qvel[self._free_qvel : self._free_qvel + 3] += np.asarray(velocity_delta, float)
         mujoco.mj_step1(self.model, self.data)
 
+    def pull(self, joint: str, torque: float) -> None:
+        """A hand on one joint: N m about it from now on; 0: it lets go."""
+        self.data.qfrc_applied[self._qvel_at[self.joints.index(joint)]] = torque
+
+    def weight_on(self, joint: str) -> tuple[float, float]:
+        """What a hand on a joint feels: the torque (N m) that keeps it from falling, and its inertia where it was built (kg m^2)."""
+        at = int(self._qvel_at[self.joints.index(joint)])
+        return float(self.data.qfrc_bias[at]), float(self.model.dof_M0[at])
+
     def release(self) -> None:
         """Unhook the gantry."""
         self.gantry.release()
@@ -141,7 +150,7 @@ class Plant:
         self.data.xfrc_applied[:] = 0.0
         self.gantry.release()
         mujoco.mj_forward(self.model, self.data)
-        self._stood = float(self.data.xpos[self._base][2]) - (hang or 0.0)
+        self._stood = float(self.data.subtree_com[self._root][2]) - (hang or 0.0)
         if hang is not None and self.floating:
             com = self.data.subtree_com[self._root] + np.array([0.0, 0.0, 0.3])
             frame = self.data.xmat[self._hook_body].reshape(3, 3)
@@ -193,6 +202,25 @@ class Plant:
         most = np.abs(self.model.jnt_actfrcrange[ids]).min(axis=1)
         return np.where(self.model.jnt_actfrclimited[ids] != 0, most, np.inf)
 
+    def gravity_torque(self, joint_pos: np.ndarray, orientation_base_in_world: np.ndarray) -> np.ndarray:
+        """N m (n,) that keep each joint at rest at ``joint_pos`` (n,), for limbs whose ends touch nothing, with the base
+        turned by the quaternion (4,) w, x, y, z. Moves the plant there."""
+        self.reset(joint_pos)
+        if self.floating:
+            self._qpos[self._free_qpos + 3 : self._free_qpos + 7] = orientation_base_in_world
+        mujoco.mj_forward(self.model, self.data)
+        return self.data.qfrc_bias[self._qvel_at].copy()
+
+    @property
+    def friction(self) -> np.ndarray:
+        """(n,) N m of dry friction in each joint."""
+        return self.model.dof_frictionloss[self._qvel_at]
+
+    @property
+    def axes_in_base(self) -> np.ndarray:
+        """(n, 3) the axis of each joint where the plant is now, in the base's frame."""
+        return self.data.xaxis[self._joint_ids] @ self.data.xmat[self._base].reshape(3, 3)
+
     @property
     def orientation_imu_in_world(self) -> np.ndarray:
         """(4,) w, x, y, z; the axes of the body that carries the IMU."""
@@ -217,8 +245,10 @@ class Plant:
 
     @property
     def fallen(self) -> bool:
-        """The base is below half the height at which it stood at reset, or leans by more than 1 rad."""
-        return bool(self.floating and (self.data.xpos[self._base, 2] < 0.5 * self._stood or self.tilt > 1.0))
+        """The centre of mass is below half the height at which it stood at reset, or the base leans by more than 1 rad.
+
+        Not the base's height: some makers put its frame on the floor."""
+        return bool(self.floating and (self.data.subtree_com[self._root, 2] < 0.5 * self._stood or self.tilt > 1.0))
 
     def truth(self) -> Truth:
         velocity = np.zeros(6)

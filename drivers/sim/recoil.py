@@ -24,6 +24,7 @@ from drivers.bus import BusSpec, MotorCommand
 from drivers.codecs import recoil
 from drivers.codecs.recoil import Function, Mode, RecoilMotors
 from drivers.sim.motor import RATED_SHARE, Answer, Body, SimMotors
+from drivers.sim.wire import priority
 from drivers.wire import EXTENDED, FRAME
 
 GEAR_RATIO = 15.0
@@ -48,6 +49,7 @@ class SimRecoil(SimMotors):
         self.mode = [Mode.IDLE] * n
         self._target = np.zeros((2, n))  # position, torque: of the last RPDO
         super().__init__(buses, body, frame_bits, **options)
+        self._keys = [priority(recoil.identifier(Function.TPDO2, m.id)) for m in motors]
 
     def factory(self) -> list[dict[str, float]]:
         return [
@@ -83,7 +85,7 @@ class SimRecoil(SimMotors):
             self._fed[row] = time
             self._set_deadline()
         if function in (Function.RPDO2, Function.RPDO3) and frame["length"] == 8:
-            answer = self._measure(row, function)
+            answer = self._answer(row) if function == Function.RPDO2 else self._measure(row)
             if self.mode[row] in DRIVING_MODES:
                 self._arrived.append((row, raw, time))
             else:
@@ -103,12 +105,14 @@ class SimRecoil(SimMotors):
             self._configure()
         return None
 
-    def _measure(self, row: int, function: int) -> Answer:
-        """The answer to an RPDO2 or RPDO3."""
-        sign = self._sign[row]
-        second = self._body.joint_vel[row] if function == Function.RPDO2 else self._body.joint_torque[row]
-        motion = self._codec.pack_motion(row, Function(function - 1), self.position[row], sign * second)
-        return self._say(row, motion)
+    def _measure(self, row: int) -> Answer:
+        """The answer to an RPDO3."""
+        torque = self._sign[row] * self._body.joint_torque[row]
+        return self._say(row, self._codec.pack_motion(row, Function.TPDO3, self.position[row], torque))
+
+    def _pack_feedback(self) -> np.ndarray:
+        """The answers to an RPDO2."""
+        return self._codec.pack_motions(self.position, self._sign * self._body.joint_vel)
 
     def _parameter(self, row: int, request: recoil.Sdo | None) -> Answer | None:
         if request is None or not request.name:
@@ -117,7 +121,9 @@ class SimRecoil(SimMotors):
         if value is not None:
             if recoil.PARAMETERS[name][2] and np.isfinite(value):
                 self._registers[row][name] = value
-                self._configure()
+                self._changed = True  # gains and limits are looked up when the law is made
+                if name in ("TORQUE_LIMIT", "WATCHDOG_TIMEOUT"):
+                    self._configure()
             return None
         live = {
             "MODE": self.mode[row],
@@ -150,9 +156,6 @@ class SimRecoil(SimMotors):
         self._fed[row] = time if mode in DRIVING_MODES else np.inf
         self._changed = True
         self._set_deadline()
-
-    def refresh(self, raw: bytes = b"") -> list[int]:
-        return self._frame_bits(np.frombuffer(raw, FRAME)).tolist() if raw else []
 
     def _obey(self, rows: list[int], frames: np.ndarray) -> None:
         for row, frame in zip(rows, frames, strict=True):

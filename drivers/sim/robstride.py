@@ -6,8 +6,10 @@ end beyond 4 pi. Flash holds what a motor that was set up holds: zero_sta 1, and
 What counts as life for the watchdog and what happens on expiry is not documented. Here: OPERATION and ENABLE count, and
 the motor goes to reset mode, free of torque (it does not damp), without a fault bit.
 
+A new id is heard at once, a new bit rate from the next power-on; both are kept without SAVE.
+
 Not modelled: control modes other than operation (run_mode is remembered; anything but 0 makes OPERATION frames
-answered and not obeyed), active reports, SET_ID, BAUD and PROTOCOL (ignored).
+answered and not obeyed), active reports and PROTOCOL (ignored), two motors with one id (one of them answers).
 """
 
 from __future__ import annotations
@@ -25,6 +27,8 @@ from drivers.sim.wire import priority
 from drivers.wire import FRAME
 
 BUS_VOLTAGE = 48.0
+CAN_ID, CAN_BITRATE = "CAN_ID", "CAN_BITRATE"  # no parameters of the protocol: see SET_ID and BAUD
+FIRST_UID = 0x5253_0000_0000_0001
 OVER_TEMPERATURE = 1 << 2  # bit of a feedback identifier
 FAULT_CLEAR = 1  # byte 0 of STOP
 
@@ -36,15 +40,19 @@ class SimRobstride(SimMotors):
         self, buses: Sequence[BusSpec], body: Body, frame_bits: Callable[[np.ndarray], np.ndarray], **options: Any
     ) -> None:
         self._codec = RobstrideMotors(BusSpec("all", "robstride", tuple(m for b in buses for m in b.motors)))
+        self._tuned: list[int] = []  # bit rates, since power-on
         super().__init__(buses, body, frame_bits, **options)
         for row in range(len(self.specs)):
             self._boot(row)
 
     def factory(self) -> list[dict[str, float]]:
         torque = self._codec.scales.torque
+        rates = [b.bitrate for b in self._bus_specs for _ in b.motors]
         return [
-            dict.fromkeys(robstride.PARAMETERS, 0.0) | {"limit_torque": t, "zero_sta": 1.0, "EPScan_time": 1.0}
-            for t in torque.tolist()
+            dict.fromkeys(robstride.PARAMETERS, 0.0)
+            | {"limit_torque": t, "zero_sta": 1.0, "EPScan_time": 1.0, robstride.UID: FIRST_UID + row}
+            | {CAN_ID: self.specs[row].id, CAN_BITRATE: rates[row]}
+            for row, t in enumerate(torque.tolist())
         ]
 
     def addressee(self, bus: int, id: int, raw: bytes) -> int:
@@ -62,6 +70,13 @@ class SimRobstride(SimMotors):
                 self._arrived.append((row, raw, time))
             return answer
         self._take_commands()  # what came before counts before
+        if kind == Type.SET_ID:
+            return self._set_id(row, id >> 16 & 0xFF)
+        if kind == Type.BAUD and raw[8:14] == robstride.SEQUENCE[:6]:
+            self._flash[row][CAN_BITRATE] = robstride.BIT_RATES.get(raw[14], self._flash[row][CAN_BITRATE])
+            return self._answer(row)
+        if kind == Type.GET_ID:
+            return self._say(row, self._codec.pack_uid(row, int(self._registers[row][robstride.UID])))
         if kind == Type.READ:
             return self._read(row, frame["data"][0])
         if kind not in (Type.ENABLE, Type.STOP, Type.SET_ZERO, Type.WRITE, Type.SAVE):
@@ -103,6 +118,12 @@ class SimRobstride(SimMotors):
         answer = robstride.pack_parameter(name, live.get(name, self._registers[row][name])) if name else data
         return self._say(row, self._codec.pack_parameter(row, answer, failed=not name))
 
+    def _set_id(self, row: int, id: int) -> Answer:
+        """It answers to GET_ID by its new name."""
+        self._registers[row][CAN_ID] = self._flash[row][CAN_ID] = id
+        self._configure()
+        return self._say(row, self._codec.pack_uid(row, int(self._registers[row][robstride.UID])))
+
     def _pack_feedback(self) -> np.ndarray:
         frames = self._codec.pack_feedback(
             self.position,
@@ -126,12 +147,16 @@ class SimRobstride(SimMotors):
         self._set_enabled(row, False, now, "over-temperature")
 
     def _boot(self, row: int) -> None:
+        self._tuned[row] = int(self._registers[row][CAN_BITRATE])
         turn = 2 * np.pi
         low = -np.pi if self._registers[row]["zero_sta"] else 0.0
         self.zero[row] += turn * np.floor((self.position[row] - low) / turn)
         self._stale = True
 
     def _configure(self) -> None:
+        self._tuned = self._tuned or [int(r[CAN_BITRATE]) for r in self._registers]
+        self._listen([(int(r[CAN_ID]), 0) for r in self._registers], self._tuned)
+        self._codec = RobstrideMotors(self._all)
         ticks = np.array([r["canTimeout"] for r in self._registers])
         self._timeout = np.where(ticks > 0, ticks * robstride.TIMEOUT_TICK, np.inf)
         torque = self._codec.scales.torque

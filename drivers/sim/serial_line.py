@@ -64,7 +64,7 @@ class SerialLine:
         """Queue bytes. Raises WireError or WireFull where a fault says so."""
         if (fault := self._host_fault(now)) is not None:
             if fault.kind == "bus_off":
-                raise WireError(f"{self.spec.name}: the adapter has gone at {now:.3f} s; unplugged?")
+                raise WireError(f"{self.spec.name}: the adapter has gone; unplugged?")
             raise WireFull(f"{self.spec.name}: the port takes nothing")
         start = max(now + self._latency, self._host_free)
         self._host_free = start + len(data) * self._byte
@@ -74,7 +74,7 @@ class SerialLine:
     def read(self, now: float) -> bytes:
         """The bytes that have arrived by ``now``."""
         if (fault := self._host_fault(now)) is not None and fault.kind == "bus_off":
-            raise WireError(f"{self.spec.name}: the adapter has gone at {now:.3f} s; unplugged?")
+            raise WireError(f"{self.spec.name}: the adapter has gone; unplugged?")
         out = b""
         while self._inbox:
             start, data, taken = self._inbox[0]
@@ -87,6 +87,11 @@ class SerialLine:
                 break
             self._inbox.popleft()
         return out
+
+    def retune(self, bitrate: int) -> None:
+        """The host's port now runs at ``bitrate``."""
+        self._byte = BITS_PER_BYTE / bitrate
+        self.servos.retune(bitrate)
 
     def _host_fault(self, now: float) -> Fault | None:
         for fault in self._faults:

@@ -145,6 +145,11 @@ class AllServos:
             servos.act(start, end)
 
     @property
+    def enabled(self) -> np.ndarray:
+        """(n,) bool: torque is on."""
+        return np.concatenate([servos.enabled for servos in self.buses])
+
+    @property
     def last_command_time(self) -> np.ndarray:
         """(n,) s, when a goal was last written; -inf: never."""
         return np.concatenate([servos.last_command_time for servos in self.buses])

@@ -55,6 +55,8 @@ class SimServos(TableServos):
     predecessor in a group read stays silent answers all the same; else it never does.
     """
 
+    BAUD_RATES = dynamixel.BAUD_RATES
+
     def __init__(
         self,
         spec: BusSpec,
@@ -72,9 +74,8 @@ class SimServos(TableServos):
         self._damping = np.array([dynamixel.damping_of(m) for m in models])
         self._unit = np.array([dynamixel.torque_scale(m) for m in models])
         self._gain = np.array([dynamixel.gain_scale(m) for m in models])
-        baud = {rate: code for code, rate in dynamixel.BAUD_RATES.items()}.get(spec.bitrate, 1)
         for row, (motor, model) in enumerate(zip(spec.motors, models, strict=True)):
-            own = {"MODEL": model.number, "ID": motor.id, "BAUD": baud, "RETURN_DELAY": 0}
+            own = {"MODEL": model.number, "ID": motor.id, "BAUD": self._baud(1), "RETURN_DELAY": 0}
             for name, register in REGISTERS.items():
                 self._set(row, name, own.get(name, register.default))
         for joint, changes in (registers or {}).items():
@@ -85,6 +86,7 @@ class SimServos(TableServos):
         self._factory = self._table.copy()
         self._turns = np.zeros(n)  # ticks that the count is off the shaft's
         self._fed = -np.inf  # s, when an instruction packet last ended
+        self._readdress()
         for row in range(n):
             self._lose_turns(row)
 
@@ -313,8 +315,8 @@ class SimServos(TableServos):
                 self._switch(row, bool(after[RAM]), time, "enabled" if after[RAM] else "disabled")
             elif name == "BUS_WATCHDOG" and tripped:
                 self._note(time, row, "cleared")
-            elif name == "ID":
-                self.row_of = {self._get(k, "ID"): k for k in range(len(self.joints))}
+            elif name in ("ID", "BAUD"):
+                self._readdress()
             elif r.address in GOALS:
                 self.last_command_time[row] = time
         return StatusError.NONE
@@ -337,6 +339,10 @@ class SimServos(TableServos):
         shaft = (self._sign * self._body.joint_pos + self._offset) / TICK + ZERO
         return shaft + self._turns + self._column("HOMING_OFFSET")
 
+    @property
+    def enabled(self) -> np.ndarray:
+        return (self._table[:, RAM] > 0) & np.array(self.powered)
+
     # -- time --------------------------------------------------------------------------------------------------------
 
     def _watch(self, now: float) -> None:
@@ -350,7 +356,7 @@ class SimServos(TableServos):
 
     def _decide(self) -> np.ndarray:
         """The law (3, n) that goals and modes make: bias, kp, kd at the joints."""
-        on = (self._table[:, RAM] > 0) * np.array(self.powered)
+        on = self.enabled
         mode = self._column("OPERATING_MODE")
         by_position = np.isin(mode, (POSITION_MODE, EXTENDED_MODE, CURRENT_POSITION_MODE))
         kp = np.where(by_position, self._column("POSITION_P_GAIN") / self._gain, 0.0)

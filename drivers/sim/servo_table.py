@@ -23,6 +23,7 @@ class TableServos:
     """The servos of one bus, on the joints of ``body`` (which has the same order). ``stall``: N m (n,)."""
 
     BOOT_TIME = 0.3  # s
+    BAUD_RATES: dict[int, int]  # bit/s, by what BAUD holds
 
     def __init__(self, spec: BusSpec, body: Body, stall: np.ndarray, size: int, log: list[MotorEvent] | None = None):
         self.spec = spec
@@ -32,7 +33,8 @@ class TableServos:
         self._body, self._stall = body, stall
         self._sign = np.array([m.sign for m in spec.motors], float)
         self._offset = np.array([m.offset for m in spec.motors])
-        self.row_of = {m.id: row for row, m in enumerate(spec.motors)}
+        self._bitrate = spec.bitrate  # at which the host talks now
+        self._row_of: dict[int, int] = {}  # see _readdress, which a protocol calls when its tables are filled
         self._table = np.zeros((n, size), np.uint8)
         self.powered = [True] * n
         self.temperature = np.full(n, AMBIENT)
@@ -64,6 +66,11 @@ class TableServos:
     def _get(self, row: int, name: str) -> int:
         raise NotImplementedError
 
+    @property
+    def enabled(self) -> np.ndarray:
+        """(n,) bool: torque is on."""
+        raise NotImplementedError
+
     def _decide(self) -> np.ndarray:
         """The law (3, n) that goals and modes make: bias, kp, kd at the joints."""
         raise NotImplementedError
@@ -92,8 +99,26 @@ class TableServos:
 
     def _addressed(self, id: int, time: float) -> list[int]:
         """Rows that listen to ``id``, by their ids as they are now."""
-        rows = range(len(self.joints)) if id == BROADCAST else [self.row_of[id]] if id in self.row_of else []
-        return [row for row in rows if self.powered[row] and time >= self._booting[row]]
+        rows = self._row_of.values() if id == BROADCAST else [self._row_of[id]] if id in self._row_of else []
+        return [row for row in rows if time >= self._booting[row]]
+
+    def retune(self, bitrate: int) -> None:
+        """The host now talks at ``bitrate``: who listens at another hears nothing."""
+        self._bitrate = bitrate
+        self._readdress()
+
+    def _readdress(self) -> None:
+        """Whom an id means: of those that have power and listen at the host's bit rate. Of two with one id, one."""
+        known = self._bitrate in self.BAUD_RATES.values()  # else a line without any time on it
+        self._row_of = {
+            self._get(row, "ID"): row
+            for row in range(len(self.joints))
+            if self.powered[row] and not (known and self.BAUD_RATES.get(self._get(row, "BAUD")) != self._bitrate)
+        }
+
+    def _baud(self, otherwise: int) -> int:
+        """What BAUD holds in servos of the wiring's bit rate; ``otherwise``: where it has no code."""
+        return next((code for code, rate in self.BAUD_RATES.items() if rate == self.spec.bitrate), otherwise)
 
     def act(self, start: float, end: float) -> None:
         """Set the body's drive for the substep from ``start`` to ``end``."""
@@ -124,6 +149,7 @@ class TableServos:
             return
         self.powered[row] = on
         self._restart(row, time, "powered on" if on else "powered off")
+        self._readdress()
 
     def _note(self, time: float, row: int, event: str) -> None:
         self.log.append(MotorEvent(time, self.spec.name, self.joints[row], event))

@@ -16,7 +16,7 @@ import numpy as np
 
 from drivers.sim.motor import MotorEvent
 from drivers.sim.truth import Truth
-from drivers.wire import ERROR, WireError, WireFull, frame_type
+from drivers.wire import ERROR, WireError, WireFull, WireGone, frame_type
 
 DATAGRAM = 1 << 18  # bytes: more than any tick
 ANSWER_TIME = 2.0  # s that a call may take
@@ -58,7 +58,7 @@ class HostSocket:
         except BlockingIOError:
             raise WireFull(f"{self.path}: the simulated robot takes nothing in; has it stopped?") from None
         except OSError as error:
-            raise WireError(f"{self.path}: {error.strerror}; the simulated robot has gone") from None
+            raise WireGone(f"{self.path}: {error.strerror}; the simulated robot has gone") from None
 
     def receive(self) -> bytes:
         parts = []
@@ -68,11 +68,11 @@ class HostSocket:
             except BlockingIOError:
                 break
             except OSError as error:
-                raise WireError(f"{self.path}: {error.strerror}; the simulated robot has gone") from None
+                raise WireGone(f"{self.path}: {error.strerror}; the simulated robot has gone") from None
             if not data:
                 if parts:  # hand over what came before the end; the next call tells
                     break
-                raise WireError(f"{self.path}: end of file; the simulated robot has gone")
+                raise WireGone(f"{self.path}: end of file; the simulated robot has gone")
             parts.append(data)
         return b"".join(parts)
 

@@ -38,6 +38,10 @@ class Motors(Protocol):
 
     powered: list[bool]
 
+    def retune(self, bus: int, bitrate: int) -> None:
+        """The host of a bus now talks at ``bitrate``."""
+        ...
+
     def addressee(self, bus: int, id: int, raw: bytes) -> int:
         """Row of the motor that a frame of the host is for; -1: none."""
         ...
@@ -108,7 +112,7 @@ class SimCan:
         """Queue frames (``frame``, (n,)). Raises WireFull, or WireError while the controller is off the bus."""
         if self._host_faults or now < self._away_until:
             if self.away(now):
-                raise WireError(f"{self.spec.name}: bus off at {now:.3f} s; check cable and termination")
+                raise WireError(f"{self.spec.name}: bus off; check cable and termination")
             for fault in self._host_faults:
                 if fault.kind == "no_buffer" and fault.start <= now < fault.end:
                     if self._random.random() < fault.probability:
@@ -133,6 +137,13 @@ class SimCan:
         while inbox and inbox[0][0] <= now + TOLERANCE:
             raws.append(inbox.popleft()[1])
         return np.frombuffer(b"".join(raws), self.frame)
+
+    def retune(self, bitrate: int) -> None:
+        """The host's controller was started anew, at ``bitrate``; what it still had to send is gone."""
+        self._queue.clear()
+        self.sent.clear()
+        self._bit = 1.0 / bitrate
+        self._motors.retune(self.index, bitrate)
 
     # -- the wire ----------------------------------------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ from policies.clips.feasibility import Residuals
 from policies.clips.format import Clip, ClipError, save_clip
 from policies.clips.mirror import mirror
 from policies.clips.resample import resample
+from policies.clips.robot import RobotBody
 from sim2real.config import load_robot
 
 # column -> how a residual is printed: key, factor, format
@@ -107,7 +108,6 @@ def retarget_clips(
     """Retarget, write ``<output>/<name>.npz`` and print the table of residuals. Raises ClipError."""
     from policies.clips import draw, feasibility
     from policies.clips.retarget import retarget
-    from policies.clips.robot import RobotBody
 
     body = RobotBody.of(load_robot(robot_name))
     clips = list(_to_retarget(words, data, body.robot.name, from_library, mirrored))
@@ -116,6 +116,9 @@ def retarget_clips(
         if place:
             place.mkdir(parents=True, exist_ok=True)
     rows: dict[str, Residuals] = {}
+    for robot in _bounces(body) if from_library else ():
+        save_clip(robot, folder / f"{robot.name}.npz")
+        rows[robot.name] = feasibility.residuals(robot, body)
     for human in track(clips, "retargeting", transient=True):
         robot, _ = retarget(human, body, fps, ball_radius or RADIUS)
         save_clip(robot, folder / f"{robot.name}.npz")
@@ -142,6 +145,15 @@ def _to_retarget(
         yield clip
         if mirrored:
             yield mirror(clip)
+
+
+def _bounces(body: RobotBody) -> Iterator[Clip]:
+    """What the library of a robot has made by formula."""
+    from policies.clips.bounce import dribble
+
+    for skill, sides in library.robot_library(body.robot).bounces.items():
+        for number, side in enumerate(sides, 1):
+            yield dribble(body, f"{skill}_{number:02d}", side=side)
 
 
 def _library_folder(robot: str) -> Path:

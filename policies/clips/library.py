@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Literal
 
 import yaml
 from pydantic import ValidationError
@@ -33,6 +34,7 @@ class Library(Strict):
     """Every piece that a robot's skills are trained on."""
 
     skills: dict[str, list[Piece]]
+    bounces: dict[str, list[Literal["left", "right"]]] = {}  # made by formula (bounce.py), by this hand
 
 
 def library_path(robot: str) -> Path:

@@ -11,6 +11,7 @@ graph          the policy: signals in, joint targets out; what is exported
 env            all of it together, many robots at once; what the critic sees
 amp            the discriminator of the AMP variant
 evaluate       the paper's measures
-train          the training run: python -m policies.skillmimic.train g1-hold
+stance         clips for robots whose legs a base policy moves
+train          the training run: sim2real train g1-ball
 release        from a checkpoint to a policy file
 """

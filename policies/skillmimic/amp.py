@@ -8,6 +8,7 @@ binary cross entropy, so that D is a probability and equation 15 can be taken as
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -45,11 +46,18 @@ class Discriminator:
     penalty = 0.5  # of the squared gradient at the clips' transitions
     ceiling = 0.99  # of D: the reward ends at 4.6, and is divided by that
 
-    def __init__(self, clips: ReferenceClips, substeps: int, seed: int) -> None:
-        self.clips, self.substeps = clips, substeps
+    def __init__(
+        self,
+        clips: ReferenceClips,
+        reference: Callable[[np.ndarray, np.ndarray], Motion],
+        substeps: int,
+        seed: int,
+    ) -> None:
+        """``reference(rows, way)``: what robots are judged by, as ``ReferenceClips.motion``."""
+        self.clips, self.reference, self.substeps = clips, reference, substeps
         self.rng = np.random.default_rng([seed, 15])
         torch.manual_seed(seed)
-        size = 2 * features(clips.motion(np.zeros(1, int), np.ones(1))).shape[1]
+        size = 2 * features(reference(np.zeros(1, int), np.ones(1))).shape[1]
         self.network = nn.Sequential(nn.Linear(size, 256), nn.ELU(), nn.Linear(256, 128), nn.ELU(), nn.Linear(128, 1))
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=5e-4, weight_decay=1e-4)
         self._robots: deque[np.ndarray] = deque()
@@ -67,7 +75,7 @@ class Discriminator:
     def references(self, count: int) -> np.ndarray:
         """(count, 2 size) transitions of the clips, every skill and clip as often as episodes start in it."""
         clip, row = self.clips.sample(self.rng, count)
-        before, after = (self.clips.motion(*self.clips.rows(clip, row + k)) for k in (0, self.substeps))
+        before, after = (self.reference(*self.clips.rows(clip, row + k)) for k in (0, self.substeps))
         return np.concatenate([features(before), features(after)], axis=1)
 
     def learn(self) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -16,6 +17,7 @@ from policies.clips.robot import POINT_NAMES, RobotBody
 from policies.contact_graph import ContactGraph, reference_edges
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.rewards import Motion
+from policies.skillmimic.stance import crouched, stand, trunk
 from policies.skillmimic.world import hands
 
 GRAVITY = 9.81  # m/s^2
@@ -33,12 +35,19 @@ class ReferenceClips:
     """Every clip of ``config.skills``, end to end.
 
     ``first`` and ``length`` (clips,): rows of each; ``skill`` (clips,) its label's index; ``swing`` (clips,) whether it
-    plays to and fro. ``qpos`` (rows, 7 + n + 7), ``qvel`` (rows, 6 + n + 6) and ``target`` (rows, n) start an episode.
+    plays to and fro, ``loop`` whether over and over. ``qpos`` (rows, 7 + n + 7), ``qvel`` (rows, 6 + n + 6) and ``target`` (rows, n) start an episode.
     """
 
     def __init__(
-        self, config: SkillMimic, model: mujoco.MjModel, body: RobotBody, graph: ContactGraph, kp: np.ndarray
+        self,
+        config: SkillMimic,
+        model: mujoco.MjModel,
+        body: RobotBody,
+        graph: ContactGraph,
+        kp: np.ndarray,
+        crouch: np.ndarray | None = None,
     ) -> None:
+        """``crouch`` (n,) rad: how a base policy bends its knees; then clips are of robots that stand (stance.py)."""
         clips: list[Clip] = []
         labels: list[int] = []
         for k, skill in enumerate(config.skills):
@@ -49,12 +58,26 @@ class ReferenceClips:
             labels += [k] * len(found)
         for clip in clips:
             _check(clip, body)
+        # How the base stands in each skill: joints (skills, n) rad, and where that has the trunk.
+        self.stances = np.tile(body.robot.home_pos, (len(config.skills), 1))
+        self.trunk_position, self.trunk_orientation = (
+            np.zeros((len(config.skills), 3)),
+            np.zeros((len(config.skills), 4)),
+        )
+        if crouch is not None:
+            for k in range(len(config.skills)):
+                mine = [i for i, label in enumerate(labels) if label == k]
+                height = float(np.mean([clips[i].base_position_in_world[:, 2].mean() for i in mine]))
+                self.stances[k], height = crouched(body, body.robot.home_pos, crouch, height)
+                self.trunk_position[k], self.trunk_orientation[k] = trunk(body, self.stances[k], height)
+                for i in mine:
+                    clips[i] = stand(clips[i], body, self.stances[k], height)
         fine = [resample(clip, 1 / config.timestep) for clip in clips]
         self.names = [clip.name for clip in clips]
         self.length = np.array([len(c) for c in fine])
         self.first = np.cumsum([0, *self.length[:-1]])
         self.skill = np.array(labels)
-        self.swing = np.array([config.skills[k] in config.swing for k in labels])
+        self.swing, self.loop = (np.array([config.skills[k] in c for k in labels]) for c in (config.swing, config.loop))
         self._motion = _concatenate([_motion(c, graph, hands(body)) for c in fine])
         rows = [_resampled(grip(c, model, body, kp, config.grip), len(f)) for c, f in zip(clips, fine, strict=True)]
         press, effort = (np.concatenate([r[i] for r in rows]) for i in (0, 1))
@@ -69,24 +92,28 @@ class ReferenceClips:
         )
         self.target = joints + effort
 
-    def sample(self, rng: np.random.Generator, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """(k,) clips and (k,) rows into them: every skill as often, then every clip of it, then every instant."""
-        skills = rng.integers(self.skill.max() + 1, size=k)
+    def sample(self, rng: np.random.Generator, k: int, skills: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
+        """(k,) clips and (k,) rows into them: every skill (of ``skills``, by index) as often, then every clip of it, then
+        every instant."""
+        chosen = np.array(skills or range(self.skill.max() + 1))
+        chosen = chosen[rng.integers(len(chosen), size=k)]
         counts = np.bincount(self.skill)
         first = np.searchsorted(self.skill, np.arange(len(counts)))
-        clip = first[skills] + np.floor(rng.random(k) * counts[skills]).astype(int)
-        last = self.length[clip] - np.where(self.swing[clip], 0, self.length[clip] // 10)  # leave something to do
+        clip = first[chosen] + np.floor(rng.random(k) * counts[chosen]).astype(int)
+        endless = self.swing[clip] | self.loop[clip]
+        last = self.length[clip] - np.where(endless, 0, self.length[clip] // 10)  # leave something to do
         return clip, np.floor(rng.random(k) * last).astype(int)
 
     def rows(self, clip: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Table rows (N,) of ``row`` (N,) steps into ``clip`` (N,), and which way time runs there: 1 or -1.
 
-        A swinging clip turns at both ends; another stays at its last row.
+        A swinging clip turns at both ends, a looping one begins again, another stays at its last row.
         """
         last = self.length[clip] - 1
         around = np.mod(row, 2 * last)
         back = self.swing[clip] & (around > last)
-        row = np.where(self.swing[clip], np.where(back, 2 * last - around, around), np.minimum(row, last))
+        once = np.where(self.loop[clip], np.mod(row, last + 1), np.minimum(row, last))
+        row = np.where(self.swing[clip], np.where(back, 2 * last - around, around), once)
         return self.first[clip] + row, np.where(back, -1.0, 1.0)
 
     def motion(self, rows: np.ndarray, way: np.ndarray) -> Motion:

@@ -24,7 +24,8 @@ from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.observations import observe
 from policies.skillmimic.randomisation import LOSS_TICKS, Randomisation
 from policies.skillmimic.rewards import SENSITIVITIES, Motion, Step, reward
-from policies.skillmimic.terminations import failed
+from policies.skillmimic.stance import ARM_POINTS
+from policies.skillmimic.terminations import failed, up
 
 BASE, JOINTS, BALL = slice(0, 7), slice(7, -7), slice(-7, -4)  # of qpos
 SPIN, RATES, FLIGHT = slice(3, 6), slice(6, -6), slice(-6, -3)  # of qvel
@@ -33,27 +34,33 @@ SPIN, RATES, FLIGHT = slice(3, 6), slice(6, -6), slice(-6, -3)  # of qvel
 class Env(VecEnv):
     """One policy period per step, ``config.envs`` robots, each somewhere inside some clip of some skill.
 
-    An episode lasts ``config.frames`` ticks; of a clip that does not swing, at most to its end.
+    An episode lasts ``config.frames`` ticks; of a clip that ends, at most ``config.after`` s beyond its end. From there on
+    the last frame is what is imitated, but for a ball in flight, which then may be anywhere.
     """
 
     level = None  # no push curriculum here
 
-    def __init__(self, config: SkillMimic, seed: int, graph: PolicyGraph | None = None) -> None:
+    def __init__(self, config: SkillMimic, seed: int, graph: PolicyGraph | None = None, skill: str = "") -> None:
+        """``skill``: only this one of the policy's."""
         self.cfg = self.config = config
         self.device = "cpu"
         self.graph = graph or PolicyGraph(config)
         self.model, self.contacts, self.clips = self.graph.model, self.graph.contact_graph, self.graph.clips
         self.sensitivity = SENSITIVITIES[config.sensitivity]
+        self.skills = [k for k, name in enumerate(config.skills) if skill in ("", name)]
         self.rng = np.random.default_rng(seed)
         self.num_envs = n = config.envs
-        self.num_actions = joints = len(self.graph.joint_names)
+        self.num_actions, joints = len(self.graph.acting), len(self.graph.joint_names)
         self.max_episode_length = config.frames
         self.episode_length_buf = torch.zeros(n, dtype=torch.long)
         self.substeps = round(config.period / config.timestep)
         self.batch = Batch(self.model, n, config.threads)
         self.random = Randomisation(self.batch, self.model)
+        self._ends = ~(self.clips.swing | self.clips.loop)
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._anchors, self._sites = self.batch.bind("xanchor"), self.batch.bind("site_xpos")
+        self._bodies, self._turns = self.batch.bind("xpos"), self.batch.bind("xquat")
+        self._trunk = self.model.body(self.graph.body.trunk).id
         self._place = _point_columns(self.graph.body)
         self._recorded: dict = {
             "qpos": np.zeros((n, self.substeps, self.model.nq)),
@@ -61,9 +68,9 @@ class Env(VecEnv):
             "sensordata": np.zeros((n, self.substeps, self.model.nsensordata)),
         }
         self.clip, self.row = np.zeros(n, np.intp), np.zeros(n, np.intp)  # what is imitated, and how far it is
-        self.skill = torch.zeros(n, len(self.graph.labels))
-        self.action, self.target = torch.zeros(n, joints), torch.zeros(n, joints)
-        self.history = torch.zeros(n, self.graph.history)
+        self.skill, self.command = torch.zeros(n, len(self.graph.labels)), torch.zeros(n, 3)
+        self.carries = {k: torch.zeros(n, *v) for k, v in self.graph.inputs().items() if k.startswith("carry_")}
+        self.action, self.target = torch.zeros(n, self.num_actions), torch.zeros(n, joints)
         self._seen = np.zeros((n, 6))  # the tracker's last answer
         self._lost = np.zeros(n, np.int64)  # ticks until it sees the ball again
         self._last_points = np.zeros((n, self._place.shape[0] + 1, 3))
@@ -73,10 +80,8 @@ class Env(VecEnv):
         self.failures = np.zeros(n, bool)
         self.discriminator: Discriminator | None = None
         if config.variant == "amp":
-            self.discriminator = Discriminator(self.clips, self.substeps, seed)
-            self._last_features = np.zeros(
-                (n, features(self.clips.motion(*self.clips.rows(self.clip, self.row))).shape[1])
-            )
+            self.discriminator = Discriminator(self.clips, self.reference, self.substeps, seed)
+            self._last_features = features(self.reference(*self.clips.rows(self.clip, self.row)))
         self.reset()
 
     # rsl_rl's side
@@ -100,7 +105,8 @@ class Env(VecEnv):
         rewards[~np.isfinite(rewards)] = 0.0
         self.episode_length_buf += 1
         over = self.episode_length_buf.numpy() >= self.max_episode_length
-        over |= ~self.clips.swing[self.clip] & (self.row >= self.clips.length[self.clip] - 1)
+        beyond = self.row - self.clips.length[self.clip] + 1  # physics steps past the end of a clip that has one
+        over |= self._ends[self.clip] & (beyond * self.config.timestep >= self.config.after)
         timeouts = over & ~self.failures
         self._push()
         self._start(np.flatnonzero(over | self.failures))
@@ -134,7 +140,7 @@ class Env(VecEnv):
         before = self.target.numpy()
         self.action = self.graph.clip(action)
         self.target = self.graph.target(self.measured, self.action)
-        self.history = self.graph.remember(self.measured)
+        self.carries = self.graph.carries(self.measured, self.action)
         delay = np.floor(self.random.drawn["action_delay"][:, 0])
         delay += self.rng.random(self.num_envs) < self.random.drawn["jitter"][:, 0]
         late = np.arange(self.substeps)[None, :, None] < delay[:, None, None]
@@ -164,10 +170,46 @@ class Env(VecEnv):
             object_velocity=qvel[:, FLIGHT],
             contact=touched.astype(float),
         )
-        reference = self.clips.motion(*self.clips.rows(self.clip, self.row - 1))
+        reference = self.reference(*self.clips.rows(self.clip, self.row - 1))
         acceleration = (state.joint_vel - self._last_joint_vel) / self.config.period
         self._last_points, self._last_joint_vel = points, state.joint_vel.copy()
-        return Step(state, reference, acceleration, action_change)
+        gone = self._ends[self.clip] & (self.row >= self.clips.length[self.clip]) & (reference.contact[:, 0] == 0)
+        self.apart = np.linalg.norm(qpos[:, BALL] - qpos[:, :3], axis=1)
+        upright = up(qpos[:, 3:7]), up(reference.orientation_base_in_world)
+        if self.graph.base is not None:
+            state, acceleration = self._arms(self._standing(state, qvel)), acceleration[:, self.graph.acting]
+        away = lambda there, here: np.where(gone[:, None], here, there)  # noqa: E731
+        reference = reference._replace(
+            object_position=away(reference.object_position, state.object_position),
+            object_velocity=away(reference.object_velocity, state.object_velocity),
+        )
+        return Step(state, reference, acceleration, action_change, qpos[:, 2], *upright)
+
+    def reference(self, rows: np.ndarray, way: np.ndarray) -> Motion:
+        """What is imitated at table ``rows`` (N,), as ``_judge`` sees states."""
+        motion = self.clips.motion(rows, way)
+        return motion if self.graph.base is None else self._arms(motion)
+
+    def _arms(self, m: Motion) -> Motion:
+        """All that an actor can help who moves nothing but the arms."""
+        points, level = m.points[:, 1 + ARM_POINTS], np.tile([1.0, 0, 0, 0], (len(m.points), 1))
+        acting = self.graph.acting
+        return Motion(points, np.zeros_like(points), level, m.joint_pos[:, acting], m.joint_vel[:, acting],
+                      m.object_position, m.object_velocity, m.contact)  # fmt: skip
+
+    def _standing(self, m: Motion, qvel: np.ndarray) -> Motion:
+        """``m`` moved to where its trunk is that of the skill's stance, in which its clips are."""
+        stance = self.clips.skill[self.clip]
+        here, facing = self.clips.trunk_position[stance], self.clips.trunk_orientation[stance]
+        there = self._bodies[:, self._trunk]
+        turn = multiply(facing, conjugate(self._turns[:, self._trunk]))
+        base, spin = m.points[:, 0], rotate(m.orientation_base_in_world, qvel[:, SPIN])
+        drift = qvel[:, :3] + np.cross(spin, there - base)
+        return m._replace(
+            points=here[:, None] + rotate(turn[:, None], m.points - there[:, None]),
+            object_position=here + rotate(turn, m.object_position - there),
+            object_velocity=rotate(turn, m.object_velocity - drift),
+        )
 
     def _observe(self) -> None:
         """Measure every robot; what its actor sees this tick, and what only the critic sees."""
@@ -188,13 +230,14 @@ class Env(VecEnv):
             "joint_vel": _tensor(np.round(joint_vel / VELOCITY_STEP) * VELOCITY_STEP),
             "orientation_base_in_world": _tensor(orientation),
             "angular_velocity_base_in_base": _tensor(gyro),
+            **({} if self.graph.base is None else {"command_velocity": self.command.clone()}),
             "skill": self.skill.clone(),
             "object_position_in_base": _tensor(seen[:, :3]),
             "object_velocity_in_base": _tensor(seen[:, 3:]),
         }
         self.inputs = inputs
-        self.carries = {"carry_action": self.action, "carry_history": self.history}
-        self.measured = self.graph.signals(*inputs.values(), *self.carries.values())
+        with torch.no_grad():
+            self.measured = self.graph.signals(**inputs, **self.carries)
         self.observation = observe(self.measured)
         self.privileged = _tensor(self._truth())
 
@@ -222,17 +265,24 @@ class Env(VecEnv):
         reference = self.clips.motion(rows, way)
         back = conjugate(qpos[:, 3:7])
         turn = multiply(back, reference.orientation_base_in_world)
+        ball = rotate(back, qpos[:, BALL] - qpos[:, :3])
+        if self.graph.base is None:
+            place = rotate(back, reference.points[:, 0] - qpos[:, :3])
+            miss = rotate(back, reference.object_position - qpos[:, BALL])
+        else:  # where the base has got to is not this actor's business
+            place, turn = np.zeros((len(back), 3)), turn * [[1.0, 1.0, 1.0, 0.0]]
+            miss = reference.object_position - reference.points[:, 0] - ball
         ahead = self.episode_length_buf.numpy()[:, None] / self.max_episode_length
         left = (self.clips.length[self.clip] - self.row)[:, None] / 200.0
         columns = [
             rotate(back, qvel[:, :3]),
-            rotate(back, reference.points[:, 0] - qpos[:, :3]) * 4,
+            place * 4,
             turn[:, 1:] * np.where(turn[:, :1] < 0, -4, 4),
             (reference.joint_pos - qpos[:, JOINTS]) * 2,
             reference.joint_vel * 0.3,
-            rotate(back, qpos[:, BALL] - qpos[:, :3]) * 4,
+            ball * 4,
             rotate(back, qvel[:, FLIGHT] - qvel[:, :3]) * 0.5,
-            rotate(back, reference.object_position - qpos[:, BALL]) * 4,
+            miss * 4,
             rotate(back, reference.object_velocity) * 0.5,
             np.minimum(self.contacts.force(self._recorded["sensordata"][:, -1]) / 20.0, 3.0),
             reference.contact,
@@ -259,7 +309,8 @@ class Env(VecEnv):
         rng, k = self.rng, len(ids)
         self.random.draw(ids, rng)
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
-        self.clip[ids], self.row[ids] = self.clips.sample(rng, k)
+        clip, row = self.clips.sample(rng, k, self.skills)
+        self.clip[ids], self.row[ids] = clip, row if self.config.anywhere else 0
         rows, _ = self.clips.rows(self.clip[ids], self.row[ids])
         qpos, qvel = self.clips.qpos[rows].copy(), self.clips.qvel[rows].copy()
         self._disturb(qpos, qvel, rng.random(k) < self.config.disturbed)
@@ -268,15 +319,25 @@ class Env(VecEnv):
         self._recorded["sensordata"][ids] = 0.0
         self.skill[ids] = one_hot(self.clips.skill[self.clip[ids]], len(self.graph.labels))
         self.target[ids] = _tensor(self.clips.target[rows])
-        self.action[ids], self.history[ids] = 0.0, 0.0
+        self.action[ids] = 0.0
+        for carry in self.carries.values():
+            carry[ids] = 0.0
+        if self.graph.base is not None:  # whose arms are where they are sent
+            self.carries["carry_base_posture"][ids] = torch.where(
+                self.graph.acts > 0, self.target[ids], _tensor(self.clips.stances[self.clips.skill[self.clip[ids]]])
+            )
+            self.carries["carry_base_skill"][ids, self.graph.base.labels.index("walk")] = 1.0
+            low, high = self.graph.base.config.command_low, self.graph.base.config.command_high
+            some = rng.random((k, 1)) > self.config.still
+            self.command[ids] = _tensor(rng.uniform(low, high, (k, 3)) * some)
         self._lost[ids] = 0
         back = conjugate(qpos[:, 3:7])
         self._seen[ids, :3] = rotate(back, qpos[:, BALL] - qpos[:, :3])
         self._seen[ids, 3:] = rotate(back, qvel[:, FLIGHT] - qvel[:, :3])
-        before = self.clips.motion(*self.clips.rows(self.clip[ids], np.maximum(self.row[ids] - 1, 0)))
-        self._last_points[ids] = before.points
+        before = self.clips.rows(self.clip[ids], np.maximum(self.row[ids] - 1, 0))
+        self._last_points[ids] = self.clips.motion(*before).points
         if self.discriminator is not None:
-            self._last_features[ids] = features(before)
+            self._last_features[ids] = features(self.reference(*before))
         self._last_joint_vel[ids] = qvel[:, RATES]
         self.episode_length_buf[ids] = 0
 

@@ -2,31 +2,44 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+import policies.graph
 from policies.clips.robot import RobotBody
 from policies.observations import gravity_in_base
+from policies.observations import observe as observe_base
 from policies.skillmimic.clips import ReferenceClips
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.observations import Signals, observe, present
 from policies.skillmimic.world import training_world
+from policies.train import graph_of
 from sim2real.config import RobotConfig, load_robot
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class PolicyGraph(nn.Module):
     """Residual actions on one posture a skill.
 
-    ``target = clip(posture[skill] + ankle strategy + scale * clip(action))``. The posture is the mean of the skill's clips,
-    with the arms' weight and the grip on the ball inside it. There is no phase and no reference in here: as in the paper
-    the policy knows the time from what it senses. ``actor`` maps an observation (N, size) to actions (N, n).
+    ``target = clip(rest + scale * clip(action))``. ``rest`` is the mean posture of the skill's clips, with the arms' weight
+    and the grip on the ball inside it; where ``config.base`` names a policy that keeps the robot up, legs and waist are
+    that policy's, which walks as it is told and sees where the arms are going. There is no phase and no reference in
+    here: as in the paper the policy knows the time from what it senses. ``actor`` maps an observation (N, size) to
+    actions (N, acting).
     """
 
     postures: Tensor
     lean: Tensor
     scale: Tensor
     ankles: Tensor
+    drive: Tensor
+    acts: Tensor
+    poses: Tensor
+    walks: Tensor
     lower: Tensor
     upper: Tensor
 
@@ -37,13 +50,26 @@ class PolicyGraph(nn.Module):
         self.joint_names, self.labels = robot.joint_names, config.skills
         self.kp, self.kd = robot.home_kp, robot.home_kd  # (n,)
         self.body = RobotBody.of(robot)
+        self.base: policies.graph.PolicyGraph | None = graph_of(ROOT / config.base) if config.base else None
+        acts = np.array([self.base is None or j.group == "arm" for j in robot.joints])
+        self.acting = np.flatnonzero(acts).tolist()
+        crouch = None
+        if self.base is not None:
+            self.base.requires_grad_(False)
+            legs = np.array([j.group == "leg" for j in robot.joints])
+            crouch = self.base.references.lift[self.base.labels.index("squat")].numpy() * legs
         self.model, self.contact_graph = training_world(robot, self.body, self.kp, self.kd, config.timestep)
-        self.clips = ReferenceClips(config, self.model, self.body, self.contact_graph, self.kp)
+        self.clips = ReferenceClips(config, self.model, self.body, self.contact_graph, self.kp, crouch)
         means = [self.clips.mean(k) for k in range(len(self.labels))]
         self.register_buffer("postures", _buffer(np.stack([posture for posture, _ in means])))
         self.register_buffer("lean", _buffer(np.stack([gravity[:1] for _, gravity in means])))
-        self.register_buffer("scale", _buffer(config.action_ratio * robot.torque_max / self.kp))
+        scale = config.action_ratio * robot.torque_max / self.kp * acts
+        self.register_buffer("scale", _buffer(scale))
+        self.register_buffer("drive", _buffer(np.diag(scale)[self.acting]))  # actions to joints
         self.register_buffer("ankles", _buffer(np.array(["ankle_pitch" in name for name in robot.joint_names])))
+        self.register_buffer("acts", _buffer(acts))
+        self.register_buffer("poses", _buffer(self.clips.stances - robot.home_pos))  # (skills, n), of the base
+        self.register_buffer("walks", _buffer(np.array([[skill in config.walks] for skill in config.skills])))
         self.register_buffer("lower", _buffer(robot.position_min + config.position_margin))
         self.register_buffer("upper", _buffer(robot.position_max - config.position_margin))
         self.actor: nn.Module = nn.Identity()
@@ -57,11 +83,8 @@ class PolicyGraph(nn.Module):
         return torch.clamp(action, -self.config.action_max, self.config.action_max)
 
     def target(self, signals: Signals, action: Tensor) -> Tensor:
-        """Joint targets (N, n) rad for a clipped ``action`` (N, n)."""
-        config = self.config
-        lean = gravity_in_base(signals.orientation_base_in_world)[:, 0:1] - signals.skill @ self.lean
-        ankle = config.balance_gain * lean + config.balance_damping * signals.angular_velocity_base_in_base[:, 1:2]
-        target = signals.posture + self.ankles * ankle + self.scale * action
+        """Joint targets (N, n) rad for a clipped ``action`` (N, acting)."""
+        target = signals.rest + action @ self.drive
         return torch.minimum(torch.maximum(target, self.lower), self.upper)
 
     def remember(self, signals: Signals) -> Tensor:
@@ -69,69 +92,81 @@ class PolicyGraph(nn.Module):
         size = self.history // self.config.history
         return torch.cat([present(signals), signals.history[:, : self.history - size]], dim=-1)
 
+    def carries(self, signals: Signals, action: Tensor) -> dict[str, Tensor]:
+        """What the next tick has to be told of this one."""
+        return {"carry_action": action, "carry_history": self.remember(signals), **signals.base}
+
     def carry_start(self) -> dict[str, list[float]]:
         """What each carried tensor is before the first tick; an empty list is zeros."""
-        return {"carry_action": [], "carry_history": []}
+        names = [n for n in self.inputs() if n.startswith("carry_")]
+        return {n: self.clips.stances[0].tolist() if n == "carry_base_posture" else [] for n in names}
 
     def inputs(self) -> dict[str, list[int]]:
         """Every input by name with its shape, without the batch axis, in the order of ``forward``."""
         n = len(self.joint_names)
+        base = {} if self.base is None else self.base.inputs()
         return {
             "joint_pos": [n],
             "joint_vel": [n],
             "orientation_base_in_world": [4],
             "angular_velocity_base_in_base": [3],
+            **({} if self.base is None else {"command_velocity": [3]}),
             "skill": [len(self.labels)],
             "object_position_in_base": [3],
             "object_velocity_in_base": [3],
-            "carry_action": [n],
+            "carry_action": [len(self.acting)],
             "carry_history": [self.history],
+            **{_of_base(name): shape for name, shape in base.items() if name.startswith("carry_")},
         }
 
     def outputs(self) -> dict[str, list[int]]:
         """Every output by name with its shape, without the batch axis, in the order of ``forward``."""
-        n = len(self.joint_names)
-        size = self.history // self.config.history + n + 3 + n + len(self.labels) + self.history
+        n, actions = len(self.joint_names), len(self.acting)
+        size = self.history // self.config.history + n + 3 + actions + len(self.labels) + self.history
         return {
             "joint_pos_target": [n],
-            "carry_action_next": [n],
-            "carry_history_next": [self.history],
+            **{f"{name}_next": shape for name, shape in self.inputs().items() if name.startswith("carry_")},
             "observation": [size],
-            "action": [n],
+            "action": [actions],
         }
 
-    def signals(
-        self,
-        joint_pos: Tensor,
-        joint_vel: Tensor,
-        orientation_base_in_world: Tensor,
-        angular_velocity_base_in_base: Tensor,
-        skill: Tensor,
-        object_position_in_base: Tensor,
-        object_velocity_in_base: Tensor,
-        carry_action: Tensor,
-        carry_history: Tensor,
-    ) -> Signals:
-        """The inputs, and what follows from them."""
-        return Signals(
-            joint_pos,
-            joint_vel,
-            orientation_base_in_world,
-            angular_velocity_base_in_base,
-            skill,
-            object_position_in_base,
-            object_velocity_in_base,
-            posture=skill @ self.postures,
-            last_action=carry_action,
-            history=carry_history,
+    def signals(self, **inputs: Tensor) -> Signals:
+        """The inputs by name, each (N, size), and what follows from them."""
+        joints = inputs["joint_pos"], inputs["joint_vel"]
+        orientation, gyro, skill = (
+            inputs[n] for n in ("orientation_base_in_world", "angular_velocity_base_in_base", "skill")
         )
+        posture, gravity, carried = skill @ self.postures, gravity_in_base(orientation), {}
+        if self.base is None:
+            config = self.config
+            ankle = config.balance_gain * (gravity[:, 0:1] - skill @ self.lean) + config.balance_damping * gyro[:, 1:2]
+            rest = posture + self.ankles * ankle
+        else:
+            # The base sees the arms on their way to where they were last sent.
+            hands = self.acts * (posture - self.base.home) + inputs["carry_action"] @ self.drive
+            pose = skill @ self.poses * (1 - self.acts) + hands
+            walk = torch.zeros(len(skill), len(self.base.labels))
+            walk[:, self.base.labels.index("walk")] = 1.0
+            command = inputs["command_velocity"] * (skill @ self.walks)
+            given = {n.replace("carry_base", "carry"): v for n, v in inputs.items() if n.startswith("carry_base_")}
+            seen = self.base.advance(*joints, orientation, gyro, command, walk, **given, pose=pose)
+            action = self.base.clip(self.base.actor(observe_base(seen)))
+            rest = torch.where(self.acts > 0, posture, self.base.target(seen, action))
+            carried = {_of_base(name): value for name, value in self.base.carries(seen, action).items()}
+        return Signals(*joints, gravity, gyro, skill, inputs["object_position_in_base"],
+                       inputs["object_velocity_in_base"], rest, inputs["carry_action"], inputs["carry_history"],
+                       carried)  # fmt: skip
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """One tick of a batch of one: the tensors of ``inputs()``, in that order, to those of ``outputs()``."""
-        signals = self.signals(*inputs)
+        signals = self.signals(**dict(zip(self.inputs(), inputs, strict=True)))
         observation = observe(signals)
         action = self.clip(self.actor(observation))
-        return self.target(signals, action), action, self.remember(signals), observation, action + 0.0
+        return self.target(signals, action), *self.carries(signals, action).values(), observation, action + 0.0
+
+
+def _of_base(carry: str) -> str:
+    return carry.replace("carry_", "carry_base_", 1)
 
 
 def _buffer(values: np.ndarray) -> Tensor:

@@ -8,22 +8,21 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from policies.observations import gravity_in_base
-
 
 class Signals(NamedTuple):
     """All that the actor may see, each (N, size): the contract's inputs, and the state carried along."""
 
     joint_pos: Tensor  # rad
     joint_vel: Tensor  # rad/s
-    orientation_base_in_world: Tensor  # w, x, y, z
+    gravity_in_base: Tensor  # unit vector
     angular_velocity_base_in_base: Tensor  # rad/s
     skill: Tensor  # one-hot
     object_position_in_base: Tensor  # m
     object_velocity_in_base: Tensor  # m/s
-    posture: Tensor  # (N, n) rad, of the skill: what actions are added to
-    last_action: Tensor  # (N, n)
+    rest: Tensor  # (N, n) rad, what actions are added to: the skill's posture, or what the base does
+    last_action: Tensor  # (N, actions)
     history: Tensor  # (N, ticks * size of PRESENT), newest first
+    base: dict[str, Tensor]  # what the base policy carries on, by name
 
 
 class Term(NamedTuple):
@@ -34,9 +33,9 @@ class Term(NamedTuple):
 
 
 PRESENT: dict[str, Term] = {  # remembered for ``config.history`` ticks
-    "gravity_in_base": Term(5.0, lambda s: gravity_in_base(s.orientation_base_in_world)),
+    "gravity_in_base": Term(5.0, lambda s: s.gravity_in_base),
     "angular_velocity_base_in_base": Term(1.0, lambda s: s.angular_velocity_base_in_base),
-    "joint_error": Term(4.0, lambda s: s.joint_pos - s.posture),
+    "joint_error": Term(4.0, lambda s: s.joint_pos - s.rest),
     "object_position_in_base": Term(4.0, lambda s: s.object_position_in_base),
 }
 TERMS: dict[str, Term] = {

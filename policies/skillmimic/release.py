@@ -14,7 +14,7 @@ from policies.export import envelope, export
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.train import load_graph
-from policies.train import git_revision
+from policies.training import git_revision
 from sim2real.policy import Policy
 
 GOLDEN_STEPS, GOLDEN = 40, 4  # ticks of each golden sequence, and how many
@@ -25,8 +25,8 @@ def release(folder: Path, path: Path, checkpoint: str = "best.pt") -> Policy:
     graph = load_graph(folder, checkpoint)
     document = json.loads((folder / "config.json").read_text())
     rows = [json.loads(line) for line in (folder / "curve.jsonl").read_text().splitlines()]
-    best = max((r for r in rows if "success" in r), key=lambda r: (r["success"], r["samples"]), default={})
-    measured = {k: best[k] for k in ("samples", "success", "accuracy", "body_error", "ball_error") if k in best}
+    best = max((r for r in rows if "score" in r), key=lambda r: (r["score"], r["samples"]), default={})
+    measured = {k: best[k] for k in ("samples", "score", "accuracy", "body_error", "ball_error") if k in best}
     return export_graph(graph, path, document["revision"], document["tools"], measured)
 
 
@@ -56,7 +56,7 @@ def export_graph(
         "history": f"{config.history} ticks, carried in carry_history",
         "envelope": envelope(seen),
         "provenance": {
-            "source": "python -m policies.skillmimic.train",
+            "source": "sim2real train",
             "revision": revision or git_revision(),
             "licence": "Apache-2.0; clips: policies/g1/clips/ATTRIBUTION.md",
             "tools": tools or {},

@@ -64,6 +64,9 @@ class Step(NamedTuple):
     reference: Motion
     joint_acceleration: np.ndarray  # (N, n) rad/s^2, over the policy period
     action_change: np.ndarray  # (N, actions)
+    height: np.ndarray  # (N,) m, of the base
+    up: np.ndarray  # (N,) cosine of its tilt
+    up_reference: np.ndarray  # (N,)
 
 
 def _mean_square(error: np.ndarray) -> np.ndarray:

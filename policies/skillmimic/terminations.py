@@ -8,7 +8,7 @@ import numpy as np
 
 from policies.skillmimic.rewards import Step
 
-BALL_LOST = 0.3  # m between ball and its reference, seen from the base, while the reference has it in hand
+BALL_LOST = 0.3  # m between ball and its reference, seen from the first key point, while the reference has it in hand
 FALLEN = 0.3  # m: the base; the retargeted pickup bends down to 0.48
 
 
@@ -24,12 +24,9 @@ def _ball_lost(s: Step) -> np.ndarray:
 
 
 TERMINATIONS: dict[str, Callable[[Step], np.ndarray]] = {
-    "fallen": lambda s: s.state.points[:, 0, 2] < FALLEN,
+    "fallen": lambda s: s.height < FALLEN,
     # 0.6 rad more than the reference leans; a bending pickup leans too
-    "tilted": lambda s: (
-        np.arccos(np.clip(up(s.state.orientation_base_in_world), -1, 1))
-        > np.arccos(np.clip(up(s.reference.orientation_base_in_world), -1, 1)) + 0.6
-    ),
+    "tilted": lambda s: np.arccos(np.clip(s.up, -1, 1)) > np.arccos(np.clip(s.up_reference, -1, 1)) + 0.6,
     "ball_lost": _ball_lost,
     "broken": lambda s: ~np.isfinite(s.state.joint_vel).all(axis=1) | (np.abs(s.state.joint_vel).max(axis=1) > 60.0),
 }

@@ -7,16 +7,17 @@ other into error frames give them away.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from drivers.bus import BusSpec, Clock
+from drivers.bus import BusSpec, Clock, MotorSpec
 from drivers.codecs import damiao
 from drivers.codecs.damiao import Operation
-from drivers.wire import ERROR, CanWire, make_frames
+from drivers.wire import ERROR, CanWire, WireFull, make_frames
 
 ANSWER_TIME = 0.01  # s for the answers to one batch of questions
 POLL_PERIOD = 0.001  # s between two looks at the wire
@@ -36,12 +37,8 @@ class Found:
     registers: dict[str, float] = field(default_factory=dict)
     duplicate: bool = False
     error: str = ""  # "": none
-
-    @property
-    def models(self) -> list[str]:
-        """The models that have its ranges."""
-        got = [self.registers.get(name, np.nan) for name in ("PMAX", "VMAX", "TMAX")]
-        return [m for m, ranges in damiao.MODELS.items() if np.allclose(got, ranges, rtol=TOLERANCE)]
+    models: list[str] | None = None  # that it may be; None: nothing tells
+    firmware: str = ""
 
 
 @dataclass
@@ -49,7 +46,8 @@ class Sweep:
     """What a sweep of one bus came to."""
 
     motors: list[Found]
-    error_frames: int = 0
+    error_frames: int = 0  # or, on a serial line, packets that were garbled
+    protocol: str = "damiao"
 
 
 def sweep_damiao(wire: CanWire, clock: Clock, ids: Iterable[int] = range(1, 0x100)) -> Sweep:
@@ -69,6 +67,10 @@ def sweep_damiao(wire: CanWire, clock: Clock, ids: Iterable[int] = range(1, 0x10
                 _read(wire, clock, batch, register, found, swept)
             missing = [id for id in found if register not in found[id].registers]
     _states(wire, clock, found, swept)
+    for motor in found.values():
+        got = [motor.registers.get(name, np.nan) for name in ("PMAX", "VMAX", "TMAX")]
+        motor.models = [m for m, ranges in damiao.MODELS.items() if np.allclose(got, ranges, rtol=TOLERANCE)]
+        motor.firmware = f"{motor.registers['SW_VER']:g}" if "SW_VER" in motor.registers else ""
     swept.motors = [found[id] for id in sorted(found)]
     return swept
 
@@ -76,9 +78,8 @@ def sweep_damiao(wire: CanWire, clock: Clock, ids: Iterable[int] = range(1, 0x10
 def _read(wire: CanWire, clock: Clock, ids: list[int], register: str, found: dict[int, Found], swept: Sweep) -> None:
     """Ask ``ids`` for a register and enter what they say."""
     answered: set[int] = set()
-    for identifier, data in _converse(
-        wire, clock, [damiao.pack_register(id, Operation.READ, register) for id in ids], swept
-    ):
+    questions = [damiao.pack_register(id, Operation.READ, register) for id in ids]
+    for identifier, data in _converse(wire, clock, questions, swept):
         answer = damiao.unpack_register(data)
         if answer.operation != Operation.READ or answer.register != register or answer.id not in ids:
             continue
@@ -106,20 +107,43 @@ def _converse(
     wire: CanWire, clock: Clock, questions: list[np.ndarray], swept: Sweep
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Send ``questions`` to everybody; the (identifier, payload) of what comes back within ANSWER_TIME."""
-    if not questions:
-        return
-    wire.send(make_frames(np.full(len(questions), damiao.BROADCAST_ID, np.uint32), np.array(questions)))
+    if questions:
+        to_all = make_frames(np.full(len(questions), damiao.BROADCAST_ID, np.uint32), np.array(questions))
+        for frame in converse(wire, clock, to_all, swept):
+            if frame["length"] == 8:
+                yield int(frame["id"]), frame["data"]
+
+
+def converse(wire: CanWire, clock: Clock, frames: np.ndarray, swept: Sweep, time: float = ANSWER_TIME) -> Iterator[Any]:
+    """Send ``frames``; each FRAME that comes back within ``time`` s. Error frames are counted. Raises WireError.
+
+    A queue that is full is a bus on which nobody acknowledges: nobody answers either.
+    """
+    with suppress(WireFull):
+        wire.send(frames)
     start = clock.now()
-    for n in range(round(ANSWER_TIME / POLL_PERIOD)):
+    for n in range(round(time / POLL_PERIOD)):
         clock.sleep_until(start + (n + 1) * POLL_PERIOD)
         for frame in wire.recv():
             if frame["id"] & ERROR:
                 swept.error_frames += 1
-            elif frame["length"] == 8:
-                yield int(frame["id"]), frame["data"]
+            else:
+                yield frame
 
 
-SWEEPS: dict[str, Callable[..., Sweep]] = {"damiao": sweep_damiao}  # by protocol
+def _damiao(motor: Found, m: MotorSpec | None) -> list[str]:
+    """What is wrong with a Damiao motor besides."""
+    r, problems = motor.registers, []
+    if r.get("CTRL_MODE", damiao.MIT_MODE) != damiao.MIT_MODE:
+        problems.append(f"CTRL_MODE {r['CTRL_MODE']:g}, expected {damiao.MIT_MODE} (MIT): write it")
+    if motor.feedback_ids == {0}:
+        problems.append(f"MST_ID 0, expected one of its own, as {motor.id + 0x10:#x}: write it")
+    if m is not None and m.feedback_id not in motor.feedback_ids:
+        got = ", ".join(f"{i:#x}" for i in sorted(motor.feedback_ids))
+        problems.append(f"answers on {got}, the wiring says {m.feedback_id:#x}: correct one of them")
+    if silent := [name for name in REGISTERS if name not in r]:
+        problems.append(f"fell silent: no answer about {', '.join(silent)}; check its connector and its power")
+    return problems
 
 
 def verdicts(swept: Sweep, spec: BusSpec | None = None) -> list[dict[str, Any]]:
@@ -130,40 +154,42 @@ def verdicts(swept: Sweep, spec: BusSpec | None = None) -> list[dict[str, Any]]:
     wired = {m.id: m for m in spec.motors} if spec else {}
     out = []
     for motor in swept.motors:
-        r, m = motor.registers, wired.get(motor.id)
+        m = wired.get(motor.id)
         problems = []
         if motor.duplicate:
-            problems.append("two motors have this id: unplug one, and give the other a new ESC_ID")
+            problems.append("two motors have this id: unplug one, and give the other a new one (`sim2real setup`)")
         if motor.error:
             problems.append(f"error: {motor.error}")
-        if r.get("CTRL_MODE", damiao.MIT_MODE) != damiao.MIT_MODE:
-            problems.append(f"CTRL_MODE {r['CTRL_MODE']:g}, expected {damiao.MIT_MODE} (MIT): write it")
-        if motor.feedback_ids == {0}:
-            problems.append(f"MST_ID 0, expected one of its own, as {motor.id + 0x10:#x}: write it")
+        if swept.protocol == "damiao":
+            problems += _damiao(motor, m)
         if spec and m is None:
             problems.append("not in the wiring: add it, or unplug it")
-        if m is not None and m.feedback_id not in motor.feedback_ids:
-            got = ", ".join(f"{i:#x}" for i in sorted(motor.feedback_ids))
-            problems.append(f"answers on {got}, the wiring says {m.feedback_id:#x}: correct one of them")
-        if silent := [name for name in REGISTERS if name not in r]:
-            problems.append(f"fell silent: no answer about {', '.join(silent)}; check its connector and its power")
-        elif m is not None and m.model not in motor.models:
-            problems.append(f"ranges of {' or '.join(motor.models) or 'no known model'}, the wiring says {m.model}")
+        elif m is not None and motor.models is not None and m.model not in motor.models:
+            problems.append(f"it is {' or '.join(motor.models) or 'no known model'}, the wiring says {m.model}")
         out.append(
             {
                 "id": motor.id,
                 "joint": m.joint if m else "",
                 "feedback_ids": sorted(motor.feedback_ids),
-                "models": motor.models,
-                "registers": r,
+                "models": motor.models or [],
+                "firmware": motor.firmware,
+                "registers": motor.registers,
                 "problems": problems,
             }
         )
     heard = {motor.id for motor in swept.motors}
     for id, m in wired.items():
         if id not in heard:
-            what = "no answer: check power, connector and bit rate; if a stranger is above, its ESC_ID may be the wrong one"
+            what = "no answer: check power, connector and bit rate; if a stranger is above, its id may be the wrong one"
             out.append(
-                {"id": id, "joint": m.joint, "feedback_ids": [], "models": [], "registers": {}, "problems": [what]}
+                {
+                    "id": id,
+                    "joint": m.joint,
+                    "feedback_ids": [],
+                    "models": [],
+                    "firmware": "",
+                    "registers": {},
+                    "problems": [what],
+                }
             )
     return sorted(out, key=lambda row: row["id"])

@@ -49,6 +49,8 @@ class Args:
     """of everything random in the simulation"""
     fault: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """faults of the simulated wire, as in drop:0.1 or off:left_leg/left_knee_joint@8 (s; arming is at about 3)"""
+    hang: bool = False
+    """leave the simulated robot on its gantry: for a policy that does not balance"""
     record: Path = Path("runs")
     """where records go: a directory, or an .mcap file"""
     no_record: bool = False
@@ -62,7 +64,9 @@ class Args:
     untuned: bool = False
     """do not ask the kernel for real-time scheduling"""
     hardware: bool = False
-    """drive real motors"""
+    """drive real motors, once everything is proved that can be (sim2real/preflight.py)"""
+    calibration: Path | None = None
+    """with --hardware: the calibration; default: what `sim2real calibrate` wrote for this robot and wiring"""
 
 
 def main(argv: list[str]) -> int:
@@ -97,8 +101,10 @@ def _check(args: Args, config: RobotConfig) -> None:
         raise Sim2realError(
             "--hardware with a script: a person arms a real robot, and stops it; add --operator keyboard"
         )
-    if args.hardware and (args.fault or args.video):
-        raise Sim2realError("--hardware with --fault or --video: those exist only in simulation; drop them")
+    if args.hardware and (args.fault or args.video or args.hang):
+        raise Sim2realError("--hardware with --fault, --video or --hang: those exist only in simulation; drop them")
+    if args.calibration and not args.hardware:
+        raise Sim2realError("--calibration without --hardware: simulated motors are where the YAML says; drop it")
     if args.visuals and not args.video:
         raise Sim2realError("--visuals without --video: nothing would be shown; add --video FILE.gif")
     if args.video and args.clock != "lockstep":
@@ -118,7 +124,10 @@ def _policies(args: Args, config: RobotConfig, console: Console):
     root = Path(__file__).resolve().parents[2]
     paths = args.policy or [root / entry.file for entry in config.policies.values()]
     if not paths:
-        raise Sim2realError(f"{config.name}: its YAML names no policy; give one with --policy FILE.onnx")
+        raise Sim2realError(
+            f"{config.name}: its YAML names no policy; give one with --policy FILE.onnx; for a first that holds its home "
+            f"posture: sim2real posture --robot {args.robot} -o FILE.onnx"
+        )
     policies = [load_policy(path, config) for path in paths]
     for policy in policies:
         contract = policy.contract
@@ -154,6 +163,15 @@ def _record_path(where: Path, robot: str) -> Path:
     if where.suffix == ".mcap":
         return where
     return where / f"{robot}-{datetime.now():%Y%m%d-%H%M%S}.mcap"
+
+
+def _calibration(args: Args, config: RobotConfig) -> Path | None:
+    """The calibration that real motors need."""
+    from sim2real.calibration import calibration_path, is_needed
+
+    if not args.hardware or not is_needed(config.wiring(args.wiring)):
+        return None
+    return args.calibration or calibration_path(config.name, args.wiring or config.default_wiring)
 
 
 def _about(args: Args, config: RobotConfig, policies) -> tuple[dict[str, object], dict[str, bytes]]:
@@ -216,7 +234,7 @@ def _lockstep(args, config, player, policies, operator, record, console):
         config,
         policies,
         operator,
-        Scene(seed=args.seed, faults=args.fault),
+        Scene(seed=args.seed, faults=args.fault, hang=args.hang),
         args.wiring,
         sink_for if record else None,
         (lambda run: camera.see(run.world.plant)) if camera else None,
@@ -258,11 +276,13 @@ def _realtime(args, config, player, policies, operator, record, console):
                 operator,
                 args.wiring,
                 simulated=not args.hardware,
+                calibration=_calibration(args, config),
                 tune=not args.untuned,
                 seed=args.seed,
                 faults=args.fault,
                 recorder=recorder,
                 show=status.show,
+                hang=args.hang,
                 timeout=10.0 if args.operator == "script" else 3600.0,
             )
             summary = launch.run()

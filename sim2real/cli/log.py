@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -198,7 +199,7 @@ def _print_summary(console: Console, s) -> None:
             "" if j.margin is None else f"{j.margin:.3f}",
             f"{j.torque_max:.1f}",
             "" if j.torque_share is None else f"{j.torque_share:.0%}",
-            f"{j.temperature_max:.0f}",
+            f"{j.temperature_max:.0f}" if math.isfinite(j.temperature_max) else "-",
         )
         for j in s.joints
     ]

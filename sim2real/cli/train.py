@@ -16,8 +16,8 @@ from sim2real.types import Sim2realError
 class Args:
     """Train a policy in simulation: config, curve and checkpoints go to a folder, from which a second call resumes."""
 
-    task: tyro.conf.Positional[Literal["g1-basics"]]
-    """what to train"""
+    task: tyro.conf.Positional[str]
+    """what to train: g1-basics, g1-ball, g1-dribble or g1-pickup"""
     folder: Path | None = None
     """where the run lives; default: runs/<task>"""
     samples: float | None = None
@@ -30,24 +30,16 @@ class Args:
     """of everything random"""
     start: Path | None = None
     """begin from the networks of this checkpoint (policies/g1/basics.pt, say) instead of from nothing"""
-    export: Path | None = None
-    """train no further: write the best checkpoint so far to this policy file (.onnx)"""
+    variant: Literal["skillmimic", "no_cgr", "no_multiplication", "deepmimic", "amp"] | None = None
+    """of the reward for ball skills"""
 
 
 def main(argv: list[str]) -> int:
     args = tyro.cli(Args, args=argv, prog="sim2real train")
     folder = args.folder or Path("runs") / args.task
-    if args.export:
-        policy = training_side("policies.release").release(folder, args.export)
-        print(
-            f"{args.export}: {', '.join(policy.contract.skill_labels)}; golden error {policy.golden_error:.1e}\n"
-            f"  sha256 {policy.sha256}\n  next: sim2real eval {args.export}"
-        )
-        return 0
+    given = {k: getattr(args, k) for k in ("samples", "envs", "threads", "seed", "variant")}
     training_side("policies.train").train_command(
-        folder=folder,
-        start=args.start,
-        **{k: getattr(args, k) for k in ("samples", "envs", "threads", "seed") if getattr(args, k) is not None},
+        args.task, folder, args.start, **{k: v for k, v in given.items() if v is not None}
     )
     return 0
 

@@ -122,8 +122,13 @@ def _header(run: Run, summary: RecordSummary) -> str:
     return f"<header><h1>{text(about.get('robot', 'A run'))}</h1><p>{line}</p>{faults}{notes}</header>"
 
 
+def degrees(value: float) -> str:
+    """A temperature, or that there is none: not every motor has a thermometer."""
+    return f"{value:.0f} °C" if np.isfinite(value) else "not measured"
+
+
 def _tiles(s: RecordSummary) -> str:
-    hot = max(s.joints, key=lambda j: j.temperature_max)
+    hot = max(s.joints, key=lambda j: np.nan_to_num(j.temperature_max, nan=-np.inf))
     stretched = max(s.joints, key=lambda j: j.torque_share or 0.0)
     margins = [j for j in s.joints if j.margin is not None]
     close = min(margins, key=lambda j: j.margin) if margins else None  # type: ignore[arg-type, return-value]
@@ -139,7 +144,7 @@ def _tiles(s: RecordSummary) -> str:
             False,
         ),
         ("refused switches", str(s.refused_switches), "", False),
-        ("hottest", f"{hot.temperature_max:.0f} °C", hot.name, False),
+        ("hottest", degrees(hot.temperature_max), hot.name, False),
         ("torque", f"{stretched.torque_share:.0%}" if stretched.torque_share else "?", stretched.name, False),
         ("closest to a limit", f"{close.margin:.3f} rad" if close else "?", close.name if close else "", False),
         ("bus load", f"{load.load_max:.0%}", f"{load.name}; {lost} frames lost or rejected", False),
@@ -224,9 +229,7 @@ def _strips(run: Run, summary: RecordSummary) -> list[str]:
             "Temperature",
             f"Motor temperature: clear is {COLD:.0f} °C, full blue {limit:.0f} °C where the gate trips, red above it.",
             '<div class="card">'
-            + strips(
-                heat, run.time, run.joints, [f"{j.temperature_max:.0f} °C" for j in summary.joints], "temperatures"
-            )
+            + strips(heat, run.time, run.joints, [degrees(j.temperature_max) for j in summary.joints], "temperatures")
             + "</div>",
         ),
     ]

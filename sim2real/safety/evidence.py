@@ -92,6 +92,10 @@ class Evidence:
     def speed(self) -> np.ndarray:
         return np.abs(self.joint_vel)
 
+    def heat(self) -> np.ndarray:
+        """deg C; of a motor without a thermometer that says nothing -inf, of any other that says nothing NaN."""
+        return np.fmax(self.temperature, self.limits.unread)
+
     def disabled_for(self) -> np.ndarray:
         """For how long each motor has not said that it is enabled, not counting the time before arming, s."""
         return self.now - np.maximum(self.enabled_at, self.armed_since)

@@ -35,6 +35,7 @@ class Limits:
     kp_max: np.ndarray  # N m/rad
     kd_max: np.ndarray  # N m s/rad
     damping: np.ndarray  # N m s/rad, kd while damping
+    unread: np.ndarray  # deg C, what no temperature counts as: NaN where a motor has a thermometer, else -inf
     position_overrun: float  # rad
     jump_ratio: float
     tilt: float  # rad
@@ -71,6 +72,7 @@ class Limits:
             kp_max=config.kp_max,
             kd_max=config.kd_max,
             damping=config.damping,
+            unread=np.where(config.thermometer, np.nan, -np.inf),
             **{name: getattr(safety, name) for name in THRESHOLDS},
         )
 

@@ -53,6 +53,22 @@ def test_answer_bytes():
     assert [name(code) for code in (38, 0, 98, 77)] == ["over-temperature", "none", "limited", "unknown fault 77"]
 
 
+# 1B: three int32 are asked for, from register 120 (A0 02); 2B answers them, the low word first.
+def test_serial_number_bytes():
+    codec = MoteusCodec(rig("moteus"))
+    (frame,) = codec.pack_register(0, moteus.SERIAL)
+    assert frame["data"][: frame["length"]].tobytes().hex(" ") == "1b a0 02"
+    said = bytes.fromhex("2b a0 02 04 03 02 01 08 07 06 05 0c 0b 0a 09")
+    answer = moteus.MoteusMotors(rig("moteus")).pack(0, moteus.HOST, said)
+    (told,) = codec.unpack_registers(answer)
+    assert told == (0, "serial_number", 0x090A0B0C_05060708_01020304, False)
+    assert moteus_frame.serial_number(b"\x21\x00\x0a") is None
+
+
+def test_after_power_on_a_turn_of_the_rotor_is_unknown():
+    assert all(MoteusCodec.TURN == pytest.approx(model.ratio * TURN) for model in moteus.MODELS.values())
+
+
 def test_identifiers():
     assert moteus.identifier(0, 1, reply=True) == 0x8001 | EXTENDED
     assert moteus.identifier(1, 0) == 0x100 and moteus.identifier(8, 0) == 0x800 | EXTENDED

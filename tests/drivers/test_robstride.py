@@ -119,13 +119,22 @@ def test_fault_frames_stay_until_enabling_clears_them():
     assert state.error.tolist() == [0, 0]
 
 
+def test_the_serial_of_a_chip_is_the_answer_to_get_id():
+    """Type 0 with the host in data, answered as type 0 to 0xFE with the 64 bits (the maker's manual, "Obtain device ID")."""
+    codec = RobstrideCodec(rig("robstride"))
+    assert hexes(codec.pack_register(0, robstride.UID)) == [("0000FD01", "00 00 00 00 00 00 00 00")]
+    answer = RobstrideMotors(rig("robstride")).pack_uid(1, 0x1122334455667788)
+    assert hexes(answer) == [("00007FFE", "88 77 66 55 44 33 22 11")]
+    assert codec.unpack_registers(answer) == [(1, robstride.UID, 0x1122334455667788, False)]
+
+
 @pytest.mark.parametrize(
     ("change", "id", "length"),
     [
         ("another motor", EXTENDED | 0x028002FD, 8),
         ("another host", EXTENDED | 0x028001FE, 8),
         ("another host's command", EXTENDED | 0x01800101, 8),
-        ("an id request", EXTENDED | 0x000001FE, 8),
+        ("an id request", EXTENDED | 0x0000FD01, 8),
         ("a standard frame", 0x0FD, 8),
         ("too short", EXTENDED | 0x028001FD, 7),
     ],

@@ -50,7 +50,6 @@ MISFITS = {
     "DRIVE_MODE": (1, "register DRIVE_MODE is 1, expected 0"),
     "MODEL": (1030, "register MODEL is 1030, expected 1020"),
     "FIRMWARE": (37, "register FIRMWARE is 37, expected 38 to 255"),
-    "BAUD": (3, "register BAUD is 3, expected 6"),
 }
 
 
@@ -60,6 +59,11 @@ def test_a_servo_that_is_not_what_the_wiring_says_is_refused_by_name(register, v
     with pytest.raises(BusError, match=said) as refusal:
         bench.connected()
     assert "servo_1" not in str(refusal.value) and "servo_3" not in str(refusal.value)
+
+
+def test_a_servo_at_another_bit_rate_is_silent_and_named():
+    with pytest.raises(BusError, match="motor of servo_3 .id 3.: no answer"):
+        Bench(3, registers={"servo_3": {"BAUD": 3}}).connected()
 
 
 def test_a_servo_that_would_not_answer_is_told_to():

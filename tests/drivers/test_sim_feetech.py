@@ -43,6 +43,24 @@ def asked(b: Bench, raw: bytes) -> str:
     return b.wire.read().hex(" ")
 
 
+def test_a_new_id_and_a_new_bit_rate_are_heard_at_once_and_kept_only_where_the_lock_was_open():
+    b = bench(2)
+    ping = lambda id: asked(b, pack(id, Instruction.PING))  # noqa: E731
+    asked(b, write(1, feetech.REGISTERS["ID"][0], 9))
+    assert ping(9) and not ping(1)
+    for address, value in (("LOCK", 0), ("BAUD", 1)):
+        asked(b, write(2, feetech.REGISTERS[address][0], value))
+    assert not ping(2)
+    for row in (0, 1):
+        b.servos.power(row, False, b.time)
+        assert not ping(9)
+        b.servos.power(row, True, b.time)
+    b.wait(0.5)
+    assert ping(1) and not ping(2)
+    b.line.retune(500_000)
+    assert ping(2) and not ping(1)
+
+
 # FT-SCS protocol manual, checksums by hand: ~(01 + 02 + 01) = FB; an answer has its error (0) for the instruction.
 def test_packets_byte_by_byte():
     b = bench()

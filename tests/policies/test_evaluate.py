@@ -150,11 +150,13 @@ def test_the_card_says_what_was_measured(file):
     labels = policy.contract.skill_labels
     rates = {label: Rate(7 + k, 20) for k, label in enumerate(labels)}
     pairs, script = switch_script(CONFIG, LABELS, 2)
-    switched = Episodes(np.arange(len(script)) > 1, np.zeros(len(script)))
+    switched = Episodes(
+        np.arange(len(script)) > 1, np.zeros(len(script)), np.zeros(len(script)), np.zeros((len(script), 2))
+    )
     single = {"0.2": Rate(20, 20), "0.3": Rate(13, 20), "0.4": Rate(9, 20), "0.5": Rate(3, 20)}
     e = Evaluation("ab" * 32, rates, rates, {label: 0.04 for label in labels}, single,
                    by([f"{labels[a]} > {labels[b]}" for a, b in pairs], switched, 2),
-                   Rate(18, 20), Rate(16, 20), Rate(9, 20), 0.07, "left_knee_joint", 0.61, ["S2R-009"])  # fmt: skip
+                   Rate(19, 20), (0.48, -0.01), Rate(18, 20), Rate(16, 20), Rate(9, 20), 0.07, "left_knee_joint", 0.61, ["S2R-009"])  # fmt: skip
     text = card(policy.contract, e)
     assert all(str(rate) in text for rate in rates.values())
     assert "100%, 65%, 45%, 15%" in text

@@ -25,7 +25,8 @@ def motion(**changes: np.ndarray) -> Motion:
 
 
 def step(state: Motion, **more: np.ndarray) -> Step:
-    rest = {"joint_acceleration": np.zeros((N, J)), "action_change": np.zeros((N, A))}
+    rest = {"joint_acceleration": np.zeros((N, J)), "action_change": np.zeros((N, A)), "height": np.full(N, 0.79),
+            "up": np.ones(N), "up_reference": np.ones(N)}  # fmt: skip
     return Step(state, motion(), **(rest | more))
 
 
@@ -86,7 +87,7 @@ def test_a_ball_that_moves_with_the_body_keeps_its_relative_reward():
 def test_the_papers_regulariser_sees_only_joints_whose_reference_stands_still():
     shaking = {"joint_acceleration": np.full((N, J), 10.0)}
     assert terms_of(step(motion(), **shaking), PAPER)["regulariser"] == pytest.approx(np.exp(-100.0))
-    moving = Step(motion(), motion(joint_vel=np.full((N, J), 0.1)), shaking["joint_acceleration"], np.zeros((N, A)))
+    moving = step(motion(), **shaking)._replace(reference=motion(joint_vel=np.full((N, J), 0.1)))
     assert terms_of(moving, PAPER)["regulariser"] == pytest.approx(1.0)
 
 

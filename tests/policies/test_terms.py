@@ -13,21 +13,22 @@ from policies.observations import TERMS, Signals, gravity_in_base, observe
 from policies.rewards import REWARDS, Tick, reward
 from policies.terminations import TERMINATIONS, failed
 
-N, JOINTS, LABELS, DRIVEN = 5, 29, 4, 15
+N, JOINTS, LABELS, DRIVEN = 5, 29, 5, 15
 
 
 def signals(seed: int = 0) -> Signals:
     g = torch.Generator().manual_seed(seed)
     random = lambda k: torch.randn(N, k, generator=g)  # noqa: E731
-    orientation = torch.nn.functional.normalize(random(4), dim=-1)
-    return Signals(random(JOINTS), random(JOINTS), orientation, random(3), torch.eye(LABELS)[[0, 1, 2, 3, 0]],
-                   torch.zeros(JOINTS), torch.rand(N, 1, generator=g), random(JOINTS), random(DRIVEN))  # fmt: skip
+    gravity = torch.nn.functional.normalize(random(3), dim=-1)
+    once = torch.rand(N, 2, generator=g)
+    return Signals(random(JOINTS), random(JOINTS), gravity, random(3), torch.eye(LABELS), torch.zeros(JOINTS), once[:, :1],
+                   random(JOINTS), random(3), once[:, 1:], random(JOINTS), random(DRIVEN))  # fmt: skip
 
 
 def tick(**changes: np.ndarray) -> Tick:
     """A robot that stands exactly where it should."""
     zeros = lambda k: np.zeros((N, k))  # noqa: E731
-    perfect = Tick(zeros(JOINTS), zeros(JOINTS), np.tile([0.0, 0.0, -1.0], (N, 1)), zeros(3), zeros(3), np.full(N, 0.78),
+    perfect = Tick(zeros(JOINTS), zeros(JOINTS), np.tile([0.0, 0.0, -1.0], (N, 1)), zeros(2), zeros(3), zeros(3), np.full(N, 0.78),
                    np.full(N, 0.78), zeros(JOINTS), zeros(JOINTS), zeros(JOINTS))  # fmt: skip
     return perfect._replace(**changes)
 
@@ -43,7 +44,9 @@ def test_observation_has_the_size_that_the_graph_declares():
 
 
 def test_gravity_in_base_agrees_with_mujoco():
-    for orientation in signals().orientation_base_in_world:
+    for orientation in torch.nn.functional.normalize(
+        torch.randn(N, 4, generator=torch.Generator().manual_seed(0)), dim=-1
+    ):
         matrix = np.zeros(9)
         mujoco.mju_quat2Mat(matrix, orientation.double().numpy())
         expected = matrix.reshape(3, 3).T @ [0.0, 0.0, -1.0]
@@ -69,7 +72,9 @@ def test_reward_is_one_for_a_robot_that_does_everything_right():
         ("legs", {"joint_pos": np.eye(N, JOINTS)}),
         ("upright", {"gravity_in_base": np.tile([0.3, 0.0, -0.95], (N, 1))}),
         ("height", {"height": np.full(N, 0.6)}),
-        ("still", {"velocity_base_in_world": np.full((N, 3), 0.5)}),
+        ("velocity", {"velocity": np.full((N, 2), 0.5)}),
+        ("velocity", {"command": np.full((N, 3), 0.5)}),
+        ("turn", {"angular_velocity_base_in_base": np.tile([0.0, 0.0, 0.5], (N, 1))}),
         ("steady", {"angular_velocity_base_in_base": np.full((N, 3), 1.0)}),
         ("action_rate", {"action": np.full((N, JOINTS), 0.5)}),
         ("action", {"action": np.full((N, JOINTS), 0.5)}),

@@ -58,6 +58,7 @@ WRONG = {
         ["--robot", "g1", "--hardware", "--operator", "keyboard", "--fault", "drop:0.1"],
         "only in simulation",
     ),
+    "hung hardware": (["--robot", "g1", "--hardware", "--operator", "keyboard", "--hang"], "only in simulation"),
     "unknown fault": (
         ["--robot", "g1", "--policy", "POLICY", "--skill", "stand", "--clock", "lockstep", "--fault", "drp:0.1"],
         "drop",
@@ -104,3 +105,12 @@ def test_a_spoiled_robot_file_is_refused_with_its_path(deploy, tmp_path, case, p
     )
     assert code == 2
     assert expected in " ".join(err.split()) and "Traceback" not in err
+
+
+def test_a_robot_without_a_policy_is_told_how_to_get_its_first(deploy, tmp_path):
+    text = (CONFIG_DIR / "bench.yaml").read_text()
+    begin, end = text.index("policies:"), text.index("default_wiring:")
+    (tmp_path / "mine.yaml").write_text(text[:begin] + text[end:])
+    code, _, err = deploy("--robot", tmp_path / "mine.yaml", "--clock", "lockstep")
+    assert code == 2
+    assert f"sim2real posture --robot {tmp_path / 'mine.yaml'}" in " ".join(err.split())

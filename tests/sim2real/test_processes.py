@@ -37,7 +37,7 @@ def launch(tmp_path):
     robot = load_robot("g1")
     file = tiny_policy.write(tmp_path / "tiny.onnx", tiny_policy.model(robot), tiny_policy.document(robot))
     player = SkillPlayer(robot, [load_policy(file, robot, trial=0)])
-    return Launch(robot, player, ScriptOperator([Step("stand", 60.0)]), gantry=False, timeout=20.0)
+    return Launch(robot, player, ScriptOperator([Step("stand", 60.0)]), hang=True, timeout=20.0)
 
 
 def when_running(launch, act, after: float = 0.3):
@@ -111,7 +111,7 @@ shown = []
 def show(launch):
     print(json.dumps({{"mode": launch.mode.name, "directory": str(launch.directory),
                        "pids": {{k: c.process.pid for k, c in launch.children.items()}}}}), flush=True)
-Launch(robot, player, ScriptOperator([Step("stand", 60.0)]), gantry=False, timeout=20.0, show=show).run()
+Launch(robot, player, ScriptOperator([Step("stand", 60.0)]), hang=True, timeout=20.0, show=show).run()
 """
 
 

@@ -6,13 +6,24 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 
 from drivers.bus import BusSpec, MotorSpec
-from drivers.codecs import damiao
+from drivers.codecs import damiao, dynamixel_packet, feetech
 from drivers.codecs.damiao import Operation
-from drivers.wire import ERROR, FRAME, make_frames
+from drivers.open import PROTOCOLS, open_world
+from drivers.wire import ERROR, EXTENDED, FRAME, make_frames
 from sim2real.bringup.sweep import Found, Sweep, sweep_damiao, verdicts
+from sim2real.bringup.sweeps import SWEEPS, sweep_dynamixel, sweep_feetech, sweep_robstride
 from sim2real.cli import main
+from sim2real.cli.scan import _sweep
+from sim2real.clock import SimClock
+from sim2real.config import CONFIG_DIR, load_robot
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
 
 
 class Clock:
@@ -122,7 +133,7 @@ WIRING = BusSpec("leg", "damiao", (MotorSpec("knee", "DM8009", 1, 0x11), MotorSp
         (Crowd((1, 0x11, 5), (2, 0x22, 6)), {2: "answers on 0x22, the wiring says 0x12"}),
         (
             Crowd((1, 0x11, 5), (2, 0x12, 6), model="DM4310"),
-            dict.fromkeys((1, 2), "ranges of DM4310, the wiring says DM8009"),
+            dict.fromkeys((1, 2), "it is DM4310, the wiring says DM8009"),
         ),
     ],
 )
@@ -166,12 +177,140 @@ def test_a_bus_with_nobody_on_it(capsys):
         (["--channel", "can0", "--sim"], "belong to a robot"),
         (["--robot", "bench", "--fault", "drop:0.1"], "add --sim"),
         (["--robot", "g1", "--bus", "left_lag"], "did you mean 'left_leg'"),
-        (["--robot", "g1", "--wiring", "dds", "--sim"], "no sweep for 'unitree_hg', expected damiao"),
+        (["--robot", "g1", "--wiring", "dds", "--sim"], "no sweep for 'unitree_hg', expected damiao or"),
         (["--channel", "can0", "--protocol", "damio"], "did you mean 'damiao'"),
-        (["--channel", "can0", "--protocol", "recoil"], "no sweep for 'recoil'"),
+        (["--channel", "can0", "--protocol", "unitree_hg"], "no sweep for 'unitree_hg'"),
         (["--channel", "nocan9"], "nocan9"),
     ],
 )
 def test_what_cannot_be_scanned_says_why(argv, message, capsys):
     assert main(["scan", *argv]) == 2
     assert message in " ".join(capsys.readouterr().err.split())
+
+
+def rig(tmp_path, protocol: str, model: str, bitrate: int, **options):
+    """The bench robot with other motors, as a YAML."""
+    document = yaml.safe_load((CONFIG_DIR / "bench.yaml").read_text())
+    (bus,) = document["wirings"]["can"]["buses"]
+    watchdog = 0.08 if PROTOCOLS[protocol].watchdog else feetech.NO_WATCHDOG if protocol == "feetech" else 0.0
+    bus |= {"protocol": protocol, "bitrate": bitrate, "watchdog": watchdog}
+    bus |= {"data_bitrate": SWEEPS[protocol].data_bitrate}
+    if PROTOCOLS[protocol].wire == "serial":
+        bus["interface"] = "serial"
+    for motor, id in zip(bus["motors"], (3, 5), strict=True):
+        motor |= {"model": model, "id": id}
+        motor.pop("feedback_id", None)
+    (tmp_path / "bench.xml").write_text((CONFIG_DIR / "bench.xml").read_text())
+    path = tmp_path / "bench.yaml"
+    path.write_text(yaml.safe_dump(document))
+    return str(path)
+
+
+RIGS = {
+    "robstride": ("RS02", 1_000_000, "RS01"),  # of the same torque: which of them, nothing tells
+    "recoil": ("6512", 1_000_000, ""),
+    "odrive": ("D6374", 1_000_000, ""),
+    "mini_cheetah": ("mini-cheetah", 1_000_000, ""),
+    "cubemars": ("AK80-9", 1_000_000, ""),
+    "robstride_mit": ("RS02", 1_000_000, ""),
+    "moteus": ("qdd100-beta2", 1_000_000, ""),
+    "dynamixel": ("XM430-W350", 1_000_000, "XM430-W350"),
+    "feetech": ("STS3215-12V", 1_000_000, "STS3215-12V"),
+}
+
+
+@pytest.mark.parametrize("protocol", RIGS)
+def test_every_protocol_that_can_be_asked_finds_its_motors_over_bytes(protocol, tmp_path, capsys):
+    model, bitrate, told = RIGS[protocol]
+    path = rig(tmp_path, protocol, model, bitrate)
+    code = main(["scan", "--robot", path, "--sim", "--json"])
+    (bus,) = json.loads(capsys.readouterr().out)
+    assert [(m["id"], m["joint"]) for m in bus["motors"]] == [(3, "shoulder_joint"), (5, "elbow_joint")]
+    assert all(not m["problems"] and (not told or told in m["models"]) for m in bus["motors"])
+    assert code == 0
+
+
+@pytest.mark.parametrize("protocol", RIGS)
+def test_a_dead_motor_is_missed_in_every_protocol(protocol, tmp_path, capsys):
+    path = rig(tmp_path, protocol, *RIGS[protocol][:2])
+    assert main(["scan", "--robot", path, "--sim", "--fault", "off:arm/elbow_joint"]) == 1
+    said = capsys.readouterr().out
+    assert "elbow_joint: no answer" in said and "shoulder_joint: no" not in said
+
+
+def test_two_robstrides_with_one_id_are_told_by_their_chips():
+    class Twins(Crowd):
+        def send(self, frames: np.ndarray) -> None:
+            for frame in frames:
+                if int(frame["id"]) & 0x1FFFFFFF == 0x0000FD05:  # GET_ID of 5
+                    for uid in (b"AAAAAAAA", b"BBBBBBBB"):
+                        data = np.frombuffer(uid, np.uint8)[None]
+                        self.waiting.append(make_frames(np.array([EXTENDED | 0x000005FE], np.uint32), data))
+
+    (motor,) = sweep_robstride(Twins(), Clock()).motors
+    assert motor.id == 5 and motor.duplicate
+
+
+class Line:
+    """A SerialWire that answers by a script."""
+
+    def __init__(self, answer) -> None:
+        self.answer, self.waiting = answer, b""
+
+    def write(self, data: bytes) -> None:
+        self.waiting += self.answer(data)
+
+    def read(self) -> bytes:
+        data, self.waiting = self.waiting, b""
+        return data
+
+
+def test_two_dynamixels_with_one_id_garble_each_other():
+    def both(data: bytes) -> bytes:
+        if data[4] != 9:
+            return b""
+        one, other = (dynamixel_packet.pack_status(9, 0, bytes([n, 4])) for n in (6, 252))
+        return bytes(a & b for a, b in zip(one, other, strict=True))  # an open collector pulls down
+
+    swept = sweep_dynamixel(Line(both), Clock(), range(8, 11))
+    assert [(m.id, m.duplicate) for m in swept.motors] == [(9, True)]
+
+
+def test_a_feetech_servo_is_found_by_its_bytes():
+    """FF FF, id, length, error, value, checksum: model 777 of an STS3215, firmware 3.9, overheated."""
+    registers = {3: bytes([0x09, 0x03]), 0: bytes([3, 9]), 7: b"\0", 33: b"\0"}
+
+    def servo(data: bytes) -> bytes:
+        assert data[:2] == b"\xff\xff" and data[4] == 2 and ~sum(data[2:-1]) & 0xFF == data[-1]
+        if data[2] != 6:
+            return b""
+        body = bytes([6, 2 + data[6], 0x04]) + registers[data[5]]
+        return b"\xff\xff" + body + bytes([~sum(body) & 0xFF])
+
+    (motor,) = sweep_feetech(Line(servo), Clock(), range(5, 8)).motors
+    assert motor.id == 6 and motor.firmware == "3.9" and motor.error == "overheating" and not motor.duplicate
+    assert motor.models == ["STS3215-7V4", "STS3215-12V"]
+
+
+def test_motors_at_another_bit_rate_are_found_when_asked_for(tmp_path, capsys):
+    path = rig(tmp_path, "dynamixel", "XM430-W350", 1_000_000)
+    config = load_robot(path)
+    world = open_world(config.model_path, config.base, config.wiring().bus_specs(), config.wiring().imu_spec(),
+                       registers={"elbow_joint": {"BAUD": 1}})  # fmt: skip
+    clock = SimClock(world.advance, lambda: world.time)
+    (spec,) = config.wiring().bus_specs()
+    bus = _sweep(spec, True, world, clock)
+    told = {m["id"]: m["problems"] for m in bus["motors"] if m["problems"]}
+    assert list(told) == [5]
+    elbow = [m for m in bus["motors"] if m["id"] == 5 and m["registers"]]
+    assert len(elbow) == 1 and "listens at 57600 bit/s, the bus runs at 1000000" in elbow[0]["problems"][0]
+
+
+def test_what_was_found_is_written_and_gone_on_from(capsys, tmp_path):
+    assert main(["scan", "--robot", "bench", "--sim"]) == 0
+    path = tmp_path / "bringup" / "bench-can-sim.scan.json"
+    written = json.loads(path.read_text())
+    written[0]["error_frames"] = 7
+    path.write_text(json.dumps(written))
+    assert main(["scan", "--robot", "bench", "--sim", "--go-on"]) == 1  # not swept again
+    assert "7 error frames" in capsys.readouterr().out

@@ -1,0 +1,180 @@
+"""Stepping by formula: what the legs do when a robot is told to walk, or has to step so as not to fall.
+
+A clock runs through one stride while steps are needed and rests with both feet on the ground. Each foot's place is that
+of a symmetric gait at the commanded velocity, moved by how much faster the robot is than commanded (Raibert, "Legged
+Robots That Balance", 1986); the clock starts by itself once the capture point (Pratt et al., 2006) leaves the feet. It
+only proposes: the actor's residual is what keeps the robot up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class Stride:
+    """Of the gait; angles are those of the line from ankle to hip, which bends about the hip."""
+
+    period: float = 0.6  # s, both feet
+    leg: float = 0.6  # m, hip to ankle
+    lift: float = 0.45  # rad of thigh and shin, at the top of a step: 9 cm if nothing gave way
+    sway: float = 0.06  # rad, of the pelvis towards the standing foot
+    pendulum: float = 3.6  # 1/s, sqrt(g / height of the centre of mass)
+    placement: float = 0.55  # of v / pendulum: how far beyond its place a foot is put, forwards ...
+    placement_aside: float = 0.95  # ... and sideways
+    load: float = 1.0  # share of the body's weight that a standing leg is told of beforehand
+    upright: float = 1.8  # rad of a standing leg's hip per rad that the trunk is pitched or rolled
+    reach: float = 0.5  # rad, the furthest of either
+    ahead: float = 0.10  # rad of the capture point beyond which a step is needed: forwards,
+    behind: float = 0.12  # backwards,
+    aside: float = 0.16  # and sideways
+    calm: float = 0.5  # share of these below which the clock may rest
+    acceleration: float = 1.2  # m/s^2 (rad/s^2) of a command
+    idle: float = 0.05  # m/s (rad/s): a smaller command is none
+
+
+class Lean(NamedTuple):
+    """How the base stands over its standing feet, each (N, 1): rad, and rad/s times the leg's length in m/s; and how the
+    trunk is turned, rad."""
+
+    forward: Tensor
+    left: Tensor
+    pitch: Tensor
+    roll: Tensor
+    forward_speed: Tensor
+    left_speed: Tensor
+
+
+class Gait(nn.Module):
+    """The formulas for robots whose leg joints carry the usual names; part of the exported graph."""
+
+    def __init__(
+        self, joint_names: Sequence[str], period: float, stride: Stride, loads: np.ndarray | None = None
+    ) -> None:
+        """``period`` s of the policy. ``loads`` (2, n) rad: how far targets lie beyond the pose, so that the left leg alone,
+        or the right one, bears the body (see ``single_loads``)."""
+        super().__init__()
+        self.stride, self.step = stride, period / stride.period
+        self.period = period
+        self.loads: Tensor
+        self.register_buffer(
+            "loads", torch.zeros(2, len(joint_names)) if loads is None else torch.tensor(loads).float()
+        )
+        for side in ("left", "right"):
+            for what, parts in {
+                "line": {"hip_pitch": 1.0, "knee": 0.5},  # thigh and shin are equally long
+                "roll": {"hip_roll": 1.0},
+                "raise": {"hip_pitch": -1.0, "knee": 2.0, "ankle_pitch": -1.0},
+                "forward": {"hip_pitch": -1.0, "ankle_pitch": 1.0},  # the sole stays level
+                "aside": {"hip_roll": 1.0, "ankle_roll": -1.0},
+                "turn": {"hip_yaw": 1.0},
+                "pitch": {"hip_pitch": 1.0},
+            }.items():
+                row = [next((v for k, v in parts.items() if name == f"{side}_{k}_joint"), 0.0) for name in joint_names]
+                self.register_buffer(f"{side}_{what}", torch.tensor(row))
+
+    def ramp(self, last: Tensor, command: Tensor) -> Tensor:
+        """The command (N, 3) that is followed now: ``command``, approached at ``stride.acceleration``."""
+        most = self.stride.acceleration * self.period
+        return last + torch.clamp(command - last, -most, most)
+
+    def lean(self, phase: Tensor, gravity: Tensor, gyro: Tensor, bend: Tensor, joint_vel: Tensor) -> Lean:
+        """From the legs that stand: left, right or, at rest, both. ``gravity`` (N, 3) and ``gyro`` (N, 3) rad/s in the
+        base, ``bend`` (N, n) rad of the joints from the pose that is stood in."""
+        left = torch.where(
+            self.resting(phase), 0.5, (phase > 0.5).to(phase.dtype)
+        )  # share of it that the left leg bears
+
+        def of(x: Tensor, what: str) -> Tensor:
+            parts = [(x @ getattr(self, f"{side}_{what}"))[:, None] for side in ("left", "right")]
+            return left * parts[0] + (1 - left) * parts[1]
+
+        leg = self.stride.leg
+        return Lean(
+            gravity[:, 0:1] + of(bend, "line"),
+            gravity[:, 1:2] - of(bend, "roll"),
+            gravity[:, 0:1],
+            -gravity[:, 1:2],
+            leg * (gyro[:, 1:2] + of(joint_vel, "line")),
+            -leg * (gyro[:, 0:1] + of(joint_vel, "roll")),
+        )
+
+    @staticmethod
+    def resting(phase: Tensor) -> Tensor:
+        """Whether both feet are on the ground to stay (N, 1) bool."""
+        return (phase == 0.0) | (phase == 0.5)
+
+    def advance(self, phase: Tensor, command: Tensor, lean: Lean) -> Tensor:
+        """This tick's phase (N, 1) in [0, 1): the left foot is in the air before 0.5, the right one after it, and at
+        exactly 0 and 0.5 both feet rest. ``command`` (N, 3): forward m/s, left m/s, turn rad/s."""
+        s = self.stride
+        resting = self.resting(phase)
+        limit = torch.where(resting, 1.0, s.calm)
+        capture = lean.forward + lean.forward_speed / (s.pendulum * s.leg)
+        capture_left = lean.left + lean.left_speed / (s.pendulum * s.leg)
+        fast = lean.forward_speed.abs() > 0.25 * (2 - limit)  # a step in mid-flight ends only when slow
+        falling = (capture > s.ahead * limit) | (capture < -s.behind * limit) | (capture_left.abs() > s.aside * limit)
+        need = (command.abs().amax(-1, keepdim=True) > s.idle) | falling | (fast & ~resting)
+        unloaded = torch.where(lean.left_speed > 0, 0.5, 0.0)  # pushed to the left: the right foot is light
+        moved = torch.where(resting, unloaded, phase) + self.step
+        crossed = torch.floor(2 * moved) > torch.floor(2 * torch.where(resting, unloaded, phase) + 1e-6)
+        landed = torch.where(crossed & ~need, torch.floor(2 * moved) / 2, moved)
+        following = landed - torch.floor(landed)
+        return torch.where(resting & ~need, phase, following)
+
+    def offsets(self, phase: Tensor, command: Tensor, lean: Lean) -> Tensor:
+        """What steps add to the reference pose (N, n) rad."""
+        s = self.stride
+        angle = 2 * torch.pi * phase
+        sin, cos = torch.sin(angle), torch.cos(angle)
+        walking = (~self.resting(phase)).to(phase.dtype)
+        swept = command * (walking * s.period / 4)
+        error, error_left = lean.forward_speed - command[:, 0:1], lean.left_speed - command[:, 1:2]
+        further = torch.clamp(s.placement * error / (s.pendulum * s.leg), -s.reach, s.reach) * walking
+        further_left = torch.clamp(s.placement_aside * error_left / (s.pendulum * s.leg), -s.reach, s.reach) * walking
+        total = (s.sway * walking * sin) * (self.left_aside + self.right_aside)
+        total = total + s.load * walking * ((1 - sin) / 2 * self.loads[0] + (1 + sin) / 2 * self.loads[1])
+        for sign, lifted, placed, side in (
+            (-1.0, torch.relu(sin) ** 2, (1 - cos) / 2, "left"),
+            (1.0, torch.relu(-sin) ** 2, (1 + cos) / 2, "right"),
+        ):
+            part = lambda what, side=side: getattr(self, f"{side}_{what}")  # noqa: E731
+            total = total + s.lift * lifted * part("raise")
+            total = total + (sign * cos * swept[:, 0:1] / s.leg + placed * further) * part("forward")
+            total = total + (sign * cos * swept[:, 1:2] / s.leg + placed * further_left) * part("aside")
+            total = total + (sign * cos * swept[:, 2:3]) * part("turn")
+            # A standing leg turns the trunk back; the other is put where it would be under a level trunk.
+            turned = torch.where(lifted > 0, -1.0, s.upright) * walking
+            total = total + turned * lean.pitch * part("pitch") + turned * lean.roll * part("roll")
+        return total
+
+
+def single_loads(model: mujoco.MjModel, pose: np.ndarray, kp: np.ndarray) -> np.ndarray:
+    """(2, n) rad: static torque over ``kp`` of the joints at ``pose`` (n,) rad when one foot bears the robot, by a force
+    from its sole towards the centre of mass, as that of an inverted pendulum. Left leg first.
+
+    ``model``: the robot alone, base first. Without it a motor with a gain of 100 N m/rad sinks by 0.3 rad, and no foot
+    ever leaves the ground.
+    """
+    data = mujoco.MjData(model)
+    data.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *pose]
+    mujoco.mj_forward(model, data)
+    mass, centre = float(model.body_subtreemass[1]), data.subtree_com[1]
+    loads = np.zeros((2, len(pose)))
+    for k, side in enumerate(("left", "right")):
+        site = model.site(f"{side}_foot").id
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jacSite(model, data, jacobian, None, site)
+        way = centre - data.site_xpos[site]
+        force = mass * 9.81 * way / way[2]
+        loads[k] = (data.qfrc_bias - jacobian.T @ force)[6:] / kp
+        other = [j for j in range(len(pose)) if model.joint(j + 1).name.startswith("right" if k == 0 else "left")]
+        loads[k, other] = 0.0
+    return loads

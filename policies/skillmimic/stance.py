@@ -1,0 +1,75 @@
+"""Clips for robots whose legs somebody else moves: what arms and ball do, put on a robot that stands.
+
+The base policy keeps the robot up and the trunk level, so the trunk is what a clip's arms and ball are seen from: the
+recorded person leans back at the hip and forward at the waist, and the trunk between them is level too. How deep the
+knees bend is taken from the height of the clip's base.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from policies.clips.format import Clip
+from policies.clips.kinematics import conjugate, multiply, rate, rotate
+from policies.clips.robot import POINT_NAMES, RobotBody
+from policies.physics import standing_height
+
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+ARM_POINTS = np.array([k for k, name in enumerate(POINT_NAMES) if name.endswith(("shoulder", "elbow", "palm"))])
+
+
+def crouched(body: RobotBody, home: np.ndarray, crouch: np.ndarray, height: float) -> tuple[np.ndarray, float]:
+    """The pose (n,) rad, ``home`` + a share of ``crouch`` (n,), whose base is at ``height`` m; and that height, or the
+    nearest to it that there is."""
+    shares = np.linspace(0.0, 1.0, 41)
+    poses = home + shares[:, None] * crouch
+    heights = standing_height(body.model, poses)
+    best = int(np.abs(heights - height).argmin())
+    return poses[best], float(heights[best])
+
+
+def trunk(body: RobotBody, pose: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """Position (3,) m and orientation (4,) of the trunk of a robot that stands at ``pose`` (n,), base level at ``height``."""
+    return _place(mujoco.MjData(body.model), body, np.array([0, 0, height]), LEVEL, pose)
+
+
+def stand(clip: Clip, body: RobotBody, pose: np.ndarray, height: float) -> Clip:
+    """The clip's arms and ball on a robot whose other joints are at ``pose`` (n,) rad, base level at ``height`` m."""
+    arms = np.array([j.group == "arm" for j in body.robot.joints])
+    data = mujoco.MjData(body.model)
+    frames = [
+        _place(data, body, *row)
+        for row in zip(clip.base_position_in_world, clip.base_orientation_in_world, clip.joint_pos, strict=True)
+    ]
+    there, turned = (np.array(x) for x in zip(*frames, strict=True))
+    base = np.array([0, 0, height])
+    here, facing = trunk(body, pose, height)
+    turn = multiply(np.tile(facing, (len(clip), 1)), conjugate(turned))
+    joint_pos = np.where(arms, clip.joint_pos, pose)
+    points = np.zeros((len(clip), len(POINT_NAMES), 3))
+    for t, joints in enumerate(joint_pos):
+        _place(data, body, base, LEVEL, joints)
+        points[t] = body.points(data)
+    return replace(
+        clip,
+        base_position_in_world=np.tile(base, (len(clip), 1)),
+        base_orientation_in_world=np.tile(LEVEL, (len(clip), 1)),
+        joint_pos=joint_pos,
+        points_in_world=points,
+        ball_position_in_world=here + rotate(turn, clip.ball_position_in_world - there),
+        ball_velocity_in_world=rotate(turn, clip.ball_velocity_in_world - rate(there, clip.fps)),
+        contact=np.column_stack([clip.contact[:, :2], np.ones((len(clip), 2), bool)]),
+    )
+
+
+def _place(
+    data: mujoco.MjData, body: RobotBody, position: np.ndarray, orientation: np.ndarray, joint_pos: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the trunk then is; kinematics of ``data`` are up to date after it."""
+    data.qpos[:3], data.qpos[3:7], data.qpos[body.qpos_at] = position, orientation, joint_pos
+    mujoco.mj_kinematics(body.model, data)
+    link = body.model.body(body.trunk).id
+    return data.xpos[link].copy(), data.xquat[link].copy()

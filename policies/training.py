@@ -1,0 +1,222 @@
+"""PPO (rsl_rl) on a vectorised environment: resumable, self-evaluating, keeping the checkpoint that scores best."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rsl_rl.algorithms import PPO
+from torch import nn
+
+from sim2real.types import Sim2realError
+
+Report = Callable[[dict[str, float]], None]
+
+
+class Training:
+    """One run in ``folder``: ``config.json``, ``curve.jsonl``, ``last.pt`` (resumes) and ``best.pt`` (scores best).
+
+    A kind of task says how its environment and networks are made (``make``), what its policy graph is (``graph``) and how
+    good that is (``evaluate``). Under torchrun every process simulates ``config.envs`` robots of its own and the
+    gradients are averaged (gloo).
+    """
+
+    def __init__(self, config: Any, folder: Path) -> None:
+        self.config, self.folder = config, folder
+        self.rank, self.world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+        torch.set_num_threads(1)
+        torch.manual_seed(config.seed + self.rank)
+        if self.world > 1:
+            torch.distributed.init_process_group("gloo")
+        self.env, self.ppo = self.make(config.seed + 1000 * self.rank)
+        if self.world > 1:
+            self.ppo.broadcast_parameters()
+        self.iteration, self.samples, self.best = 0, 0, -1.0
+
+    def make(self, seed: int) -> tuple[Any, PPO]:
+        """The environment, and the learner on it."""
+        raise NotImplementedError
+
+    def graph(self) -> Any:
+        """The policy graph with the networks as they are now."""
+        raise NotImplementedError
+
+    def evaluate(self) -> dict[str, float]:
+        """What training selects by, as ``score``, and whatever else belongs into the curve."""
+        raise NotImplementedError
+
+    def run(self, report: Report = lambda row: None) -> None:
+        """Until ``config.samples`` have been seen. ``report(row)`` after each iteration."""
+        config, first = self.config, self.rank == 0
+        if first:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / "config.json").write_text(json.dumps(self._provenance(), indent=1))
+        while self.samples < config.samples:
+            row = self.step()
+            if first and self.iteration % config.evaluate_every == 0:
+                row |= self.evaluate()
+                if row["score"] >= self.best:
+                    self.best = row["score"]
+                    self._save("best.pt")
+            if first:
+                with (self.folder / "curve.jsonl").open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+                report(row)
+            if self.iteration % config.save_every == 0 or self.samples >= config.samples:
+                if first:
+                    self._save("last.pt")
+                self.env.reset()  # what a resumed run does too, so both continue alike
+
+    def step(self) -> dict[str, float]:
+        """One iteration: collect ``horizon`` ticks, update. Returns a row of the curve."""
+        config, ppo, env = self.config, self.ppo, self.env
+        ppo.train_mode()
+        total, survived, fell = 0.0, 0, 0
+        with torch.no_grad():
+            observations = env.get_observations()
+            for _ in range(config.horizon):
+                observations, rewards, dones, extras = env.step(ppo.act(observations))
+                # Scaled so that the value of an undisturbed state is about 1.
+                ppo.process_env_step(observations, (1 - config.gamma) * rewards, dones, extras)
+                total += float(rewards.mean())
+                survived += int(extras["time_outs"].sum())
+                fell += int(env.failures.sum())
+            ppo.compute_returns(observations)
+        losses = ppo.update()
+        self.iteration += 1
+        self.samples += config.horizon * env.num_envs * self.world
+        return {
+            "iteration": self.iteration,
+            "samples": self.samples,
+            "reward": total / config.horizon,
+            "fell": fell,
+            "survived": survived,
+            "level": env.level or 0.0,
+            "std": float(ppo.actor.output_std.detach().mean()),
+            "learning_rate": ppo.learning_rate,
+            **{f"loss_{k}": float(v) for k, v in losses.items()},
+        }
+
+    def resume(self) -> bool:
+        """Continue from ``last.pt`` if there is one; then everything goes on as if it had never stopped."""
+        path = self.folder / "last.pt"
+        if not path.is_file():
+            return False
+        state = torch.load(path, weights_only=True)
+        self.ppo.load(state["ppo"], None, strict=True)
+        self.iteration, self.samples, self.best = state["iteration"], state["samples"], state["best"]
+        self.env.load_state_dict(state["env"])
+        torch.set_rng_state(state["torch_rng"])
+        if self.rank > 0:  # the checkpoint holds the first process's dice: the others get their own
+            torch.manual_seed(self.config.seed + self.rank + self.iteration)
+            self.env.rng = np.random.default_rng([self.config.seed, self.rank, self.iteration])
+            self.env.reset()
+        if self.rank == 0:  # what came after the checkpoint never happened
+            curve = self.folder / "curve.jsonl"
+            lines = curve.read_text().splitlines(keepends=True) if curve.is_file() else []
+            curve.write_text("".join(x for x in lines if json.loads(x)["iteration"] <= self.iteration))
+        return True
+
+    def start_from(self, checkpoint: Path) -> None:
+        """Take the networks and the optimiser of another run; samples and curve begin at zero. Raises Sim2realError."""
+        try:
+            self.ppo.load(torch.load(checkpoint, weights_only=True)["ppo"], None, strict=True)
+        except Exception as error:  # torch has no common base for what a wrong file raises
+            reason = str(error).splitlines()[0]
+            raise Sim2realError(
+                f"{checkpoint}: {reason}; expected a checkpoint of this network (best.pt, last.pt)"
+            ) from None
+
+    def _save(self, name: str) -> None:
+        state = {
+            "config": dataclasses.asdict(self.config),
+            "ppo": self.ppo.save(),
+            "iteration": self.iteration,
+            "samples": self.samples,
+            "best": self.best,
+            "env": self.env.state_dict(),
+            "torch_rng": torch.get_rng_state(),
+        }
+        torch.save(state, self.folder / f"{name}.part")
+        os.replace(self.folder / f"{name}.part", self.folder / name)
+
+    def _provenance(self) -> dict:
+        tools = ("mujoco", "torch", "rsl-rl-lib", "numpy")
+        return {
+            "config": dataclasses.asdict(self.config),
+            "world": self.world,
+            "revision": git_revision(),
+            "tools": {name: version(name) for name in tools},
+        }
+
+
+def make_ppo(config: Any, env: Any, actor: dict, critic: dict, sees: dict[str, list[str]]) -> PPO:
+    """rsl_rl's PPO. ``actor`` and ``critic``: rsl_rl's settings of each network, beyond ``config``'s; ``sees``: which
+    groups of observations each is given."""
+    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    network = {"class_name": "MLPModel", "hidden_dims": list(config.hidden), "activation": "elu"}
+    noise = {"class_name": "GaussianDistribution", "init_std": config.std, "std_type": "scalar"}
+    settings = {
+        "num_steps_per_env": config.horizon,
+        "obs_groups": sees,
+        "actor": {**network, **actor, "distribution_cfg": noise},
+        "critic": {**network, **critic},
+        "algorithm": {"class_name": "PPO", "gamma": config.gamma, "learning_rate": config.learning_rate, **config.ppo},
+        "multi_gpu": {"global_rank": rank, "local_rank": rank, "world_size": world} if world > 1 else None,
+    }
+    with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
+        ppo: PPO = PPO.construct_algorithm(env.get_observations(), env, settings, "cpu")
+    with torch.no_grad():
+        last = [m for m in ppo.actor.mlp.modules() if isinstance(m, nn.Linear)][-1]
+        last.weight.mul_(0.01)  # start with no action at all
+        last.bias.zero_()
+    return ppo
+
+
+def weights(state: dict, part: str) -> dict[str, torch.Tensor]:
+    """The parameters of ``actor`` or ``critic`` in a checkpoint's ``state``, named as in the plain network."""
+    found = state["ppo"][f"{part}_state_dict"]
+    return {k.removeprefix("mlp."): v for k, v in found.items() if k.startswith("mlp.")}
+
+
+def read_checkpoint(path: Path, make: Callable[[dict[str, Any]], Any]) -> tuple[dict, Any]:
+    """A checkpoint's state, and its settings as ``make`` makes them of the document. Raises Sim2realError."""
+    if not path.is_file():
+        raise Sim2realError(f"{path}: no such checkpoint; train first: sim2real train --help lists the tasks")
+    state = torch.load(path, weights_only=True)
+    return state, settings(state.get("config", {}), make, path)
+
+
+def read_config(folder: Path, make: Callable[[dict[str, Any]], Any]) -> Any:
+    """The settings written beside a run's checkpoints. Raises Sim2realError if they are of another version."""
+    return settings(json.loads((folder / "config.json").read_text())["config"], make, folder / "config.json")
+
+
+def settings(document: dict[str, Any], make: Callable[[dict[str, Any]], Any], where: Path) -> Any:
+    """``make`` of a document that was JSON, or came from ``where``. Raises Sim2realError if it is of another version."""
+    try:
+        return make({k: tuple(v) if isinstance(v, list) else v for k, v in document.items()})
+    except (TypeError, KeyError) as error:
+        raise Sim2realError(
+            f"{where}: its settings are of another version ({error}); check out the revision that made it, or train anew"
+            " in another folder"
+        ) from None
+
+
+def git_revision() -> str:
+    """The commit of the working tree, with ``+`` if it has changes; empty outside a repository."""
+    root = Path(__file__).resolve().parents[1]
+    run = lambda *a: subprocess.run(["git", *a], cwd=root, capture_output=True, text=True).stdout.strip()  # noqa: E731
+    with contextlib.suppress(OSError):
+        return run("rev-parse", "HEAD") + ("+" if run("status", "--porcelain", "--", "policies", "configs") else "")
+    return ""

@@ -1,0 +1,227 @@
+"""What is demanded of a real robot before it may be armed: each demand fails by name, and no motor was ever driven.
+
+The robots are simulated down to their bytes, behind the same wires, buses and codecs as real ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.open import open_world
+from sim2real.calibration import Calibration, MotorCalibration, load_calibration
+from sim2real.clock import SimClock
+from sim2real.config import RobotConfig, load_robot
+from sim2real.preflight import Preflight
+from sim2real.robot import open_robot
+from sim2real.types import Sim2realError
+
+HARMLESS = {"enabled", "disabled", "watchdog", "cleared", "limp", "powered off", "powered on"}
+
+
+@dataclass
+class Rig:
+    """A simulated robot in the place of a real one."""
+
+    preflight: Preflight
+    world: Any
+    told: list[str]
+
+    def refusal(self) -> str:
+        with pytest.raises(Sim2realError) as refused:
+            self.preflight.run()
+        self.unmoved()
+        return str(refused.value)
+
+    def unmoved(self) -> None:
+        assert {e.event for e in self.world.motor_log} <= HARMLESS
+        assert not self.world.motors.enabled.any()
+
+
+def rig(name: str = "bench", wiring: str = "", calibration: Calibration | None = None, **options) -> Rig:
+    config = load_robot(name)
+    wiring = wiring or config.default_wiring
+    wired = config.wiring(wiring)
+    home = dict(zip(config.joint_names, config.home_pos, strict=True))
+    world = open_world(
+        config.model_path, config.base, wired.bus_specs(), wired.imu_spec(), **{"joint_pos": home} | options
+    )
+    world.advance(0.1)
+    calibration = calibration or measured(config, wiring)
+    wired = calibration.applied_to(wired)
+    robot = open_robot(config, wired, {**world.wires, "imu": world.imu_wire})
+    told: list[str] = []
+    clock = SimClock(world.advance, lambda: world.time)
+    return Rig(Preflight(config, wiring, wired, robot, clock, calibration, tell=told.append), world, told)
+
+
+def measured(config: RobotConfig, wiring: str, first: int = 1001) -> Calibration:
+    """The calibration that the twin has."""
+    joints = {j.name: j.position for j in config.joints}
+    specs = [(b, m) for b in config.wiring(wiring).bus_specs() for m in b.motors]
+    return Calibration(robot=config.name, wiring=wiring, checked=True, motors=[
+        MotorCalibration(joint=m.joint, bus=b.name, id=m.id, fingerprint=f"SN {first + i}", sign=m.sign, offset=m.offset,
+                         position=joints[m.joint], span=joints[m.joint][1] - joints[m.joint][0])
+        for i, (b, m) in enumerate(specs)])  # fmt: skip
+
+
+def changed(calibration: Calibration, of: str, **values) -> Calibration:
+    motors = [m.model_copy(update=values) if m.joint == of else m for m in calibration.motors]
+    return calibration.model_copy(update={"motors": motors})
+
+
+BENCH = measured(load_robot("bench"), "can")
+
+
+@pytest.mark.parametrize("name", ["bench", "g1"])
+def test_a_robot_with_which_all_is_well_is_ready_and_every_watchdog_was_seen_to_trip(name):
+    r = rig(name)
+    r.preflight.run()
+    r.unmoved()
+    tripped = [e.joint for e in r.world.motor_log if e.event == "watchdog"]
+    assert sorted(tripped) == sorted(r.preflight.config.joint_names)
+    assert not r.world.motors.error.any() and not r.told
+
+
+def test_motors_are_silent_on_the_wire_while_watchdogs_are_tried():
+    """Else a question might have fed them."""
+    r = rig()
+    sent: list[float] = []
+    wire = r.preflight.robot.buses[0]._wire
+    send = wire.send
+    wire.send = lambda frames: (sent.append(r.world.time), send(frames))
+    r.preflight.run()
+    watchdog = r.preflight.wiring.buses[0].watchdog
+    assert sum(gap > watchdog for gap in np.diff(sent)) == 1
+
+
+CALIBRATIONS = {
+    "another robot": (BENCH.model_copy(update={"robot": "g1"}), "got one of g1, wiring can; expected bench"),
+    "half": (BENCH.model_copy(update={"motors": BENCH.motors[:1]}), "not measured yet: elbow_joint"),
+    "unchecked": (BENCH.model_copy(update={"checked": False}), "gravity and symmetry have not been checked"),
+    "other range": (changed(BENCH, "elbow_joint", position=(-2.0, 2.4)), "the YAML now says [-2.4, 2.4]"),
+    "other motor": (changed(BENCH, "elbow_joint", id=7), "got motor arm/0x7, expected arm/0x2"),
+    "stranger": (changed(BENCH, "elbow_joint", joint="knee"), "knee: got a joint that the wiring has not"),
+    "replaced motor": (changed(BENCH, "elbow_joint", fingerprint="SN 7"), "elbow_joint: got motor SN 1002, expected SN 7"),
+    "twice": (BENCH.model_copy(update={"motors": [*BENCH.motors, BENCH.motors[0]]}), "more than once: shoulder_joint"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CALIBRATIONS)
+def test_a_calibration_that_is_not_of_this_robot_is_refused(case):
+    calibration, expected = CALIBRATIONS[case]
+    assert expected in rig(calibration=calibration).refusal()
+
+
+def test_no_calibration_is_refused():
+    r = rig()
+    r.preflight.calibration = None
+    assert "calibration:\n  got no calibration" in r.refusal()
+
+
+def test_ranges_of_another_model_are_refused_by_motor():
+    said = rig(registers={"elbow_joint": {"VMAX": 45.0}}).refusal()
+    assert "motor of elbow_joint" in said and "VMAX is 45, expected 30" in said
+
+
+def test_a_bus_without_room_is_refused_before_anything_is_sent():
+    r = rig()
+    r.preflight.wiring = r.preflight.wiring.model_copy(update={"rate": 1900.0})
+    assert "bus load:\n  bus arm: got a load of 88% at 1900 Hz, expected at most 70%" in r.refusal()
+    assert r.world.counters()["arm"]["frames"] == 0
+
+
+def test_a_motor_that_falls_silent_is_refused_by_name():
+    r = rig(faults=["off:arm/elbow_joint@0.15"])
+    said = r.refusal()
+    assert "freshness:\n  elbow_joint: last heard" in said and "shoulder" not in said
+
+
+def test_a_silent_imu_is_refused():
+    assert "IMU: last heard inf s ago" in rig(faults=["off:imu"]).refusal()
+
+
+def test_a_watchdog_that_does_not_trip_is_refused_by_name():
+    r = rig()
+    trip = r.world.motors._trip
+    r.world.motors._trip = lambda row, now: trip(row, now) if row == 0 else None  # a firmware that forgets it
+    said = r.refusal()
+    assert "watchdogs:\n  elbow_joint: is still enabled" in said and "shoulder" not in said
+
+
+def test_a_motor_that_does_not_enable_is_refused_by_name():
+    r = rig()
+    decide = r.world.motors._set_enabled
+    r.world.motors._set_enabled = lambda row, on, *rest: decide(row, on and row != 0, *rest)
+    assert "shoulder_joint: not enabled after 0.3 s" in r.refusal()
+
+
+@pytest.mark.parametrize("turns", [-1, 1, 2])
+def test_a_lost_turn_is_put_back(turns):
+    """Calibrated before the power went; the motor now counts from elsewhere."""
+    r = rig(calibration=changed(BENCH, "elbow_joint", offset=BENCH.motors[1].offset + turns * 2 * np.pi))
+    r.preflight.run()
+    assert r.told == ["whole turns put back since the calibration: elbow_joint"]
+    joint_pos = r.preflight.look().joint_pos
+    np.testing.assert_allclose(joint_pos, r.world.plant.joint_pos, atol=0.01)
+    target = r.preflight.robot
+    command = joint_pos.copy()
+    np.testing.assert_allclose(
+        command[target._joint_of_motor] * target._motor_sign + target._motor_offset,
+        r.world.motors.position, atol=0.01,
+    )  # fmt: skip
+
+
+def test_a_joint_that_no_turn_brings_into_its_range_is_refused():
+    said = rig(calibration=changed(BENCH, "shoulder_joint", offset=3.1)).refusal()
+    assert "turns:\n  shoulder_joint: reads" in said and "no whole turn" in said
+
+
+def test_a_joint_that_two_turns_bring_into_its_range_is_refused():
+    """A joint of more than a turn."""
+    r = rig()
+    joints = [j.model_copy(update={"position": (-4.5, 4.5)}) for j in r.preflight.config.joints]
+    r.preflight.config = r.preflight.config.model_copy(update={"joints": joints})
+    r.preflight.calibration = measured(r.preflight.config, "can")
+    r.world.plant.reset([2.0, 0.0])
+    assert "shoulder_joint: reads" in (said := r.refusal()) and "fit; move it" in said and "elbow" not in said
+
+
+def test_another_variant_than_that_of_the_policies_is_refused():
+    r = rig("g1", "dds")
+    r.preflight = replace(r.preflight, calibration=None, variants=(6,))
+    said = []
+    with pytest.raises(Sim2realError, match="got mode_machine 5, expected 6 as robot and policies say"):
+        r.preflight.run()
+    r.preflight = replace(r.preflight, variants=(5,), tell=said.append)
+    r.preflight.run()
+    assert any("no watchdog can be programmed" in text for text in said)
+
+
+def test_a_calibration_is_written_and_read_back(tmp_path):
+    path = tmp_path / "deep" / "bench.yaml"
+    BENCH.save(path)
+    assert load_calibration(path) == BENCH
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "expected"),
+    [("sign: 1", "sign: 0", "sign"), ("offset: 0.0", "offset: .nan", "offset"), ("robot: bench", "robto: bench", "did you"),
+     ("schema_version: 1", "schema_version: 2", "schema_version"), ("span: 4.0", "span: -1", "span")],
+)  # fmt: skip
+def test_a_spoiled_calibration_is_refused_with_its_path(tmp_path, before, after, expected):
+    path = tmp_path / "bench.yaml"
+    BENCH.save(path)
+    text = path.read_text()
+    assert before in text
+    path.write_text(text.replace(before, after, 1))
+    with pytest.raises(Sim2realError, match=expected):
+        load_calibration(path)
+
+
+def test_a_calibration_that_is_not_there_says_how_to_get_one(tmp_path):
+    with pytest.raises(Sim2realError, match="sim2real calibrate"):
+        load_calibration(tmp_path / "none.yaml")
