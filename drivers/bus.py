@@ -6,7 +6,8 @@ Signs, offsets and joint names belong to ``sim2real.robot``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from typing import Protocol
 
 import numpy as np
@@ -91,6 +92,15 @@ class MotorState:
         """A state that knows nothing: NaN everywhere, received never."""
         nan = lambda: np.full(n, np.nan)  # noqa: E731
         return cls(nan(), nan(), nan(), nan(), np.zeros(n, np.int64), np.zeros(n, bool), np.full(n, -np.inf))
+
+    @classmethod
+    def concatenate(cls, states: Sequence[MotorState]) -> MotorState:
+        """A copy of several, one after the other."""
+        return cls(*(np.concatenate([getattr(s, f.name) for s in states]) for f in fields(cls)))
+
+    def part(self, rows: slice) -> MotorState:
+        """A view of some motors: what is written to it is written to the whole."""
+        return MotorState(*(getattr(self, f.name)[rows] for f in fields(self)))
 
 
 @dataclass(slots=True)

@@ -10,19 +10,21 @@ taken back: at most ``txqueuelen`` (default 10) frames go out when the bus comes
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import groupby
 from typing import NamedTuple, NoReturn, Protocol
 
 import numpy as np
 
-from drivers.bus import BusCounters, BusError, BusSpec, Clock, MotorCommand, MotorState
-from drivers.wire import ERROR, CanWire, WireError, WireFull
+from drivers.bus import BusCounters, BusError, BusSpec, Clock, MotorBus, MotorCommand, MotorSpec, MotorState
+from drivers.wire import ERROR, FRAME, CanWire, WireError, WireFull
 
 TRIES = 7  # of a request while connecting: a motor that loses every tenth frame still connects
 ANSWER_TIME = 0.04  # s to wait for the answers to one try
 POLL_PERIOD = 0.001  # s between two looks at the wire while waiting
 QUEUE_FULL_TIME = 1.0  # s with no tick going out whole, then the bus is dead
 REGISTER_TOLERANCE = 1e-4  # relative, of a float register
+NOTHING = np.zeros(0, FRAME)
 
 
 class RegisterCheck(NamedTuple):
@@ -43,8 +45,23 @@ class RegisterAnswer(NamedTuple):
     written: bool  # the answer to a write, not to a read
 
 
+class TickCodec(Protocol):
+    """What a protocol whose tick is one frame to and one from each motor does for n motors, whatever buses they are on."""
+
+    def __init__(self, motors: Sequence[MotorSpec]) -> None: ...
+
+    def pack_command(self, command: MotorCommand) -> np.ndarray: ...
+
+    def unpack_whole(self, frames: np.ndarray, state: MotorState, now: float) -> bool:
+        """Put ``frames`` into ``state`` if they are an answer of every motor in turn, else leave it. Returns which."""
+        ...
+
+
 class CanCodec(Protocol):
-    """One protocol on CAN, for the n motors of one bus. Pure: frames in and out, no wire, no clock."""
+    """One protocol on CAN, for the n motors of one bus. Pure: frames in and out, no wire, no clock.
+
+    One whose tick is plain says in ``TICK`` which TickCodec it has for motors on several buses.
+    """
 
     TICK_BITS: tuple[float, float]  # bits of a motor's command and answer on the wire: typical, worst
     IDENTITY: tuple[str, ...]  # registers that tell a motor from any other
@@ -99,10 +116,12 @@ class CanBus:
         self._hear_all(clock)
 
     def poll(self) -> None:
+        self._refuse_unconnected()
         self._transmit(self._codec.pack_poll(self._state))
 
     def enable(self) -> None:
         """Raises BusError if not every frame went out: some motors may be enabled then, so disable."""
+        self._refuse_unconnected()
         self._transmit(self._codec.pack_enable(self._state), required=True)
 
     def disable(self) -> None:
@@ -114,13 +133,11 @@ class CanBus:
 
     def write(self, command: MotorCommand) -> None:
         """Before ``connect`` only damping (kp 0) is sent: it is what is left to do for a process that has died."""
-        self._transmit(self._codec.pack_command(command), unconnected=not np.any(command.kp))
+        self._refuse_torque(command)
+        self._transmit(self._codec.pack_command(command))
 
     def read(self, now: float) -> MotorState:
-        frames = self._receive()
-        if len(frames):
-            self.counters.received += len(frames)
-            self.counters.rejected += self._codec.unpack(frames, self._state, now)
+        self._take(self._receive(), now)
         return self._state
 
     def error_name(self, code: int) -> str:
@@ -138,10 +155,17 @@ class CanBus:
     def close(self) -> None:
         self._wire.close()
 
-    def _transmit(self, frames: np.ndarray, required: bool = False, unconnected: bool = False) -> None:
-        """Send one tick. ``required``: a full queue is an error at once, and not only after QUEUE_FULL_TIME."""
-        if self._clock is None and not unconnected:
+    def _refuse_unconnected(self) -> None:
+        if self._clock is None:
             raise BusError(f"bus {self.spec.name}: not connected; call connect(clock) first")
+
+    def _refuse_torque(self, command: MotorCommand) -> None:
+        """Raise BusError before ``connect`` for a command that is more than damping."""
+        if self._clock is None and np.any(command.kp):
+            self._refuse_unconnected()
+
+    def _transmit(self, frames: np.ndarray, required: bool = False) -> None:
+        """Send one tick. ``required``: a full queue is an error at once, and not only after QUEUE_FULL_TIME."""
         try:
             self._wire.send(frames)
         except WireFull as error:
@@ -161,15 +185,25 @@ class CanBus:
                 self._whole = self._clock.now()
 
     def _receive(self) -> np.ndarray:
+        """What arrived, with what the controller says of itself (ERROR)."""
         try:
-            frames = self._wire.recv()
+            return self._wire.recv()
         except WireError as error:
             raise BusError(f"bus {self.spec.name} ({self._where()}): {error}") from error
+
+    def _heard(self, frames: np.ndarray) -> np.ndarray:
+        """Those of ``frames`` that are a motor's; errors are counted."""
         error = frames["id"] & ERROR
         if errors := np.count_nonzero(error):
             self.counters.extra["bus_errors"] += int(errors)
             frames = frames[error == 0]
+        self.counters.received += len(frames)
         return frames
+
+    def _take(self, frames: np.ndarray, now: float) -> None:
+        """Put what arrived into the state."""
+        if len(frames := self._heard(frames)):
+            self.counters.rejected += self._codec.unpack(frames, self._state, now)
 
     def _check(self, check: RegisterCheck, clock: Clock) -> None:
         """Write (if it is to be written) and read back one register of every motor, and compare."""
@@ -237,8 +271,7 @@ class CanBus:
             end = clock.now() + ANSWER_TIME
             while clock.now() < end:
                 clock.sleep_until(clock.now() + POLL_PERIOD)
-                frames = self._receive()
-                self.counters.received += len(frames)
+                frames = self._heard(self._receive())
                 self._strangers.update(frames["id"][self._codec.owners(frames) < 0].tolist())
                 if take(frames):
                     return True
@@ -263,3 +296,68 @@ class CanBus:
 def _agree(got: float, expected: float) -> bool:
     """NaN agrees with nothing."""
     return abs(got - expected) <= REGISTER_TOLERANCE * abs(expected)
+
+
+class CanBuses:
+    """Several buses as one to ``read`` and ``write``: a tick of all their motors is packed and unpacked in one call.
+
+    Each bus stays what it is, with its own wire, counters and failures. What is not one answer of every motor in turn
+    (something was lost, or an error frame came) is taken apart bus by bus.
+    """
+
+    def __init__(self, buses: Sequence[CanBus], codec: TickCodec) -> None:
+        self._buses, self._codec = buses, codec
+        ends = np.cumsum([len(bus.spec.motors) for bus in buses]).tolist()
+        self._rows = [slice(end - len(bus.spec.motors), end) for bus, end in zip(buses, ends, strict=True)]
+        self._state = MotorState.concatenate([bus._state for bus in buses])
+        for bus, rows in zip(buses, self._rows, strict=True):
+            bus._state = self._state.part(rows)
+
+    def read(self, now: float) -> MotorState:
+        """As of a MotorBus. A bus that fails keeps its state; the first failure is raised when all have been read."""
+        arrived, failures = [], []
+        for bus in self._buses:
+            try:
+                arrived.append(bus._receive())
+            except BusError as error:
+                failures.append(error)
+                arrived.append(NOTHING)
+        whole = self._codec.unpack_whole(np.concatenate(arrived), self._state, now)
+        for bus, frames in zip(self._buses, arrived, strict=True):
+            if whole:
+                bus.counters.received += len(frames)
+            else:
+                bus._take(frames, now)
+        if failures:
+            raise failures[0]
+        return self._state
+
+    def write(self, command: MotorCommand) -> None:
+        """As of a MotorBus. A bus that fails is told when all have been written to."""
+        frames, failures = self._codec.pack_command(command), []
+        for bus, rows in zip(self._buses, self._rows, strict=True):
+            try:
+                bus._refuse_torque(command)
+                bus._transmit(frames[rows])
+            except BusError as error:
+                failures.append(error)
+        if failures:
+            raise failures[0]
+
+
+def joined(buses: Sequence[MotorBus]) -> list[tuple[MotorBus | CanBuses, int]]:
+    """``buses`` in their order, neighbours of one protocol as CanBuses where it has a TickCodec; and how many motors each
+    has."""
+
+    def tick(bus: MotorBus) -> type[TickCodec] | None:
+        return getattr(bus._codec, "TICK", None) if isinstance(bus, CanBus) else None
+
+    parts: list[tuple[MotorBus | CanBuses, int]] = []
+    for codec, group in groupby(buses, tick):
+        some = list(group)
+        motors = [m for bus in some for m in bus.spec.motors]
+        if codec is None or len(some) == 1:
+            parts += [(bus, len(bus.spec.motors)) for bus in some]
+        else:
+            parts.append((CanBuses([bus for bus in some if isinstance(bus, CanBus)], codec(motors)), len(motors)))
+    return parts

@@ -1,6 +1,9 @@
-"""Serial wire (UART, USB serial, RS-485) over pyserial."""
+"""Serial wire (UART, USB serial, RS-485) over pyserial, which opens and sets the port; bytes go straight to the kernel."""
 
 from __future__ import annotations
+
+import os
+import select
 
 from drivers.wire import WireError, WireFull, WireGone
 
@@ -15,34 +18,46 @@ class PySerialWire:
         import serial
 
         self._where = f"serial {device} at {baud} baud"
-        self._error = (serial.SerialException, OSError)  # the former is an OSError in pyserial 3, by name elsewhere
+        errors = (serial.SerialException, OSError)  # the former is an OSError in pyserial 3, by name elsewhere
         try:
-            self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
-        except (*self._error, ValueError) as error:
+            self._port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)  # non-blocking
+            self._file = self._port.fileno()
+        except (*errors, ValueError) as error:
             raise WireError(
                 f"{self._where}: {error}\n  Is it plugged in, free, and is this user in the group that owns it (dialout)?"
             ) from None
         try:
             self._port.set_low_latency_mode(True)  # FTDI: 1 ms instead of 16 between two deliveries
-        except (*self._error, ValueError, AttributeError):
+        except (*errors, ValueError, AttributeError):
             pass  # not an adapter with such a timer
 
     def write(self, data: bytes) -> None:
         try:
-            sent = self._port.write(data) or 0
-        except self._error as error:
+            sent = os.write(self._file, data)
+        except BlockingIOError:
+            sent = 0
+        except OSError as error:
             raise WireGone(f"{self._where}: writing: {error}; unplugged?") from None
         if sent < len(data):
             raise WireFull(f"{self._where}: sent {sent} of {len(data)} bytes; the rest was dropped")
 
     def read(self) -> bytes:
         try:
-            return self._port.read(READ_SIZE)
-        except self._error as error:
+            data = os.read(self._file, READ_SIZE)
+            gone = (
+                not data and select.select([self._file], [], [], 0)[0] and not (data := os.read(self._file, READ_SIZE))
+            )
+        except BlockingIOError:
+            return b""
+        except OSError as error:
             raise WireGone(f"{self._where}: reading: {error}; unplugged?") from None
+        if gone:  # it has something to say, and that is nothing
+            raise WireGone(f"{self._where}: reading: end of file; unplugged?")
+        return data
 
     def fileno(self) -> int:
-        return self._port.fileno()
+        return self._file
 
     def close(self) -> None:
         self._port.close()
+        self._file = -1  # another file may get its number

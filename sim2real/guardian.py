@@ -87,6 +87,7 @@ class Guardian:
         self.done = False
         self.record = states.layout.new()
         self.record["mode"] = Mode.OFF
+        self._fields = {name: self.record[name] for name in states.layout.dtype.names or ()}  # views: cheaper to fill
         self._state = state_view(self.record)
         self._sent = command_view(self.record, "command")
         self._requested = command_view(self.record, "request")
@@ -101,6 +102,7 @@ class Guardian:
         budgets = [budget(bus.spec, 1.0 / period) for bus in robot.buses]
         self._load = np.array([b.load / b.frames for b in budgets])  # of the wire, a frame per tick
         self._frames = np.zeros(len(robot.buses))
+        self._counted = np.zeros((4, len(robot.buses)), np.int64)
         self._tick = 0
 
     def tick(self, scheduled: float, lateness: float = 0.0, late: int = 0) -> None:
@@ -111,14 +113,14 @@ class Guardian:
 
     def sense(self, scheduled: float, lateness: float = 0.0, late: int = 0) -> None:
         """Take in what the robot said and publish it. Never raises for anything that a bus does."""
-        r, start = self.record, self.clock.now()
+        r, start = self._fields, self.clock.now()
         self._failed = Calls(0)
         self._guard(lambda: self.robot.read(start, self._state), Calls.STOP)
-        r["time"], r["tick"], r["late"], r["timing.lateness"] = scheduled, self._tick, late, lateness
+        r["time"][0], r["tick"][0], r["late"][0], r["timing.lateness"][0] = scheduled, self._tick, late, lateness
         self._lost |= np.isfinite(self._state.joint_age) & (self._state.joint_age > self.restart_time)
-        r["state.time"], r["state.imu_age"] = self._state.time, self._state.imu_age
-        r["timing.read"] = self.clock.now() - start
-        self.states.write(r)
+        r["state.time"][0], r["state.imu_age"][0] = self._state.time, self._state.imu_age
+        r["timing.read"][0] = self.clock.now() - start
+        self.states.write(self.record)
 
     def act(self) -> None:
         """Let the gate decide on the newest request and send the outcome. Never raises for anything that a bus, a policy
@@ -230,27 +232,29 @@ class Guardian:
 
     def _store(self, command: JointCommand, calls: Calls, times: tuple[float, float, float]) -> None:
         """Complete the tick's record, for the log and for the next ``sense`` to publish."""
-        r, fault = self.record, self.safety.fault
+        r, fault = self._fields, self.safety.fault
         start, judged, written = times
-        r["now"], r["calls"] = start, int(calls)
-        r["mode"], r["limited"] = self.safety.mode, self.safety.limited
-        r["fault"] = fault.rule.number if fault else 0
-        r["fault_joint"] = fault.joint if fault else -1
+        r["now"][0], r["calls"][0] = start, int(calls)
+        r["mode"][0], r["limited"][0] = self.safety.mode, self.safety.limited
+        r["fault"][0] = fault.rule.number if fault else 0
+        r["fault_joint"][0] = fault.joint if fault else -1
         _copy(self._wish, self._requested)
-        r["request.time"] = self._wish.time
+        r["request.time"][0] = self._wish.time
         _copy(command, self._sent)
-        r["command.time"] = command.time
-        r["timing.safety"], r["timing.write"] = judged - start, written - judged
-        counted = [
+        r["command.time"][0] = command.time
+        r["timing.safety"][0], r["timing.write"][0] = judged - start, written - judged
+        c = self._counted
+        c.T[:] = [
             (b.counters.sent, b.counters.received, b.counters.rejected, b.counters.lost) for b in self.robot.buses
         ]
-        r["bus.sent"][0], r["bus.received"][0], r["bus.rejected"][0], r["bus.lost"][0] = zip(*counted, strict=True)
-        frames = (r["bus.sent"] + r["bus.received"])[0]
+        r["bus.sent"][0], r["bus.received"][0], r["bus.rejected"][0], r["bus.lost"][0] = c
+        frames = c[0] + c[1]
         if self._tick:  # smoothed over a tenth of a second; without what connecting took
-            r["bus.load"][0] += 10 * self.period * ((frames - self._frames) * self._load - r["bus.load"][0])
+            load = r["bus.load"][0]
+            load += 10 * self.period * ((frames - self._frames) * self._load - load)
         self._frames = frames
         if self.sink is not None:
-            self.sink.write(TICK, float(r["time"][0]), r)
+            self.sink.write(TICK, float(r["time"][0]), self.record)
 
 
 def _copy(source: JointCommand, target: JointCommand) -> None:

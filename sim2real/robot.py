@@ -7,11 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from drivers.budget import check
 from drivers.bus import Clock, Imu, ImuState, MotorBus, MotorCommand, MotorState
+from drivers.can_bus import joined
 from drivers.open import open_bus, open_imu
 from sim2real.config import RobotConfig, Wiring
 from sim2real.types import JointCommand, RobotState
@@ -32,13 +34,14 @@ class Robot:
         self._joint_of_motor = joint_of_motor
         self._motor_sign = np.array([m.sign for m in motors], float)
         self._motor_offset = np.array([m.offset for m in motors], float)
-        stops = np.cumsum([0] + [len(bus.spec.motors) for bus in self.buses])
+        self._parts, sizes = zip(*joined(self.buses), strict=True)  # each read and written in one call
+        stops = np.cumsum([0, *sizes])
         self._command = np.zeros((5, len(motors)))  # position, velocity, kp, kd, torque of every motor
         self._commands = [
             MotorCommand(*(self._command[row, start:stop] for row in range(5)))
             for start, stop in zip(stops[:-1], stops[1:], strict=True)
         ]
-        self._states = [MotorState.empty(len(bus.spec.motors)) for bus in self.buses]
+        self._states = [MotorState.empty(size) for size in sizes]
         self._imu_state = ImuState.empty()
         mount = np.array(imu.spec.orientation_imu_in_base, float)
         self._mount = mount / np.linalg.norm(mount)
@@ -61,17 +64,18 @@ class Robot:
         A bus that cannot be read keeps its last state, whose ages grow; the first such BusError is raised at the end.
         """
         states = self._states
-        failure = self._each(lambda bus, i: states.__setitem__(i, bus.read(now)))
+        failure = _each(self._parts, lambda bus, i: states.__setitem__(i, bus.read(now)))
         order = self._motor_of_joint
         state.time = now
-        np.subtract(np.concatenate([s.position for s in states])[order], self._offset, out=state.joint_pos)
+        motors = states[0] if len(states) == 1 else MotorState.concatenate(states)
+        np.subtract(motors.position[order], self._offset, out=state.joint_pos)
         state.joint_pos *= self._sign
-        np.multiply(np.concatenate([s.velocity for s in states])[order], self._sign, out=state.joint_vel)
-        np.multiply(np.concatenate([s.torque for s in states])[order], self._sign, out=state.joint_torque)
-        state.joint_temperature[:] = np.concatenate([s.temperature for s in states])[order]
-        state.joint_error[:] = np.concatenate([s.error for s in states])[order]
-        state.joint_enabled[:] = np.concatenate([s.enabled for s in states])[order]
-        np.subtract(now, np.concatenate([s.time for s in states])[order], out=state.joint_age)
+        np.multiply(motors.velocity[order], self._sign, out=state.joint_vel)
+        np.multiply(motors.torque[order], self._sign, out=state.joint_torque)
+        state.joint_temperature[:] = motors.temperature[order]
+        state.joint_error[:] = motors.error[order]
+        state.joint_enabled[:] = motors.enabled[order]
+        np.subtract(now, motors.time[order], out=state.joint_age)
         try:
             imu = self._imu_state = self.imu.read(now)
         except Exception as error:  # noqa: BLE001 - raised below
@@ -98,14 +102,14 @@ class Robot:
         c[2] = command.kp[of]
         c[3] = command.kd[of]
         np.multiply(command.joint_torque[of], sign, out=c[4])
-        self._act(lambda bus, i: bus.write(self._commands[i]))
+        self._act(self._parts, lambda bus, i: bus.write(self._commands[i]))
 
     def poll(self) -> None:
         """Ask every motor for its state, commanding nothing."""
-        self._act(lambda bus, i: bus.poll())
+        self._act(self.buses, lambda bus, i: bus.poll())
 
     def enable(self) -> None:
-        self._act(lambda bus, i: bus.enable())
+        self._act(self.buses, lambda bus, i: bus.enable())
 
     def disable(self) -> None:
         """Take torque off every motor. Never raises."""
@@ -126,19 +130,20 @@ class Robot:
             bus.close()
         self.imu.close()
 
-    def _act(self, act: Callable[[MotorBus, int], None]) -> None:
-        if (failure := self._each(act)) is not None:
+    def _act(self, parts: Sequence[Any], act: Callable[[Any, int], None]) -> None:
+        if (failure := _each(parts, act)) is not None:
             raise failure
 
-    def _each(self, act: Callable[[MotorBus, int], None]) -> Exception | None:
-        """Do it on every bus even if one fails, for one dead bus must not silence four. Returns the first failure."""
-        first: Exception | None = None
-        for i, bus in enumerate(self.buses):
-            try:
-                act(bus, i)
-            except Exception as error:  # noqa: BLE001 - returned
-                first = first or error
-        return first
+
+def _each(parts: Sequence[Any], act: Callable[[Any, int], None]) -> Exception | None:
+    """Do it on every bus even if one fails, for one dead bus must not silence four. Returns the first failure."""
+    first: Exception | None = None
+    for i, part in enumerate(parts):
+        try:
+            act(part, i)
+        except Exception as error:  # noqa: BLE001 - returned
+            first = first or error
+    return first
 
 
 def open_robot(

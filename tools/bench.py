@@ -22,6 +22,7 @@ BENCHES = (
     "unitree",
     "dynamixel",
     "policy",
+    "rate",
     "lockstep",
     "walk",
     "loop",
@@ -33,7 +34,7 @@ class Args:
     """Which benchmarks to run, and where to write the figures."""
 
     only: tyro.conf.Positional[tuple[str, ...]] = field(default=BENCHES)
-    """Benchmarks to run: codec unitree dynamixel policy lockstep walk loop."""
+    """Benchmarks to run: codec unitree dynamixel policy rate lockstep walk loop."""
     json: Path = Path("runs/bench.json")
     """The same figures for a program to read."""
 

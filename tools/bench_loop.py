@@ -73,7 +73,7 @@ def measure(load: str, tuned: bool) -> Iterator[Row]:
     faults = [f for s in summaries for f in s["faults"]]
     yield Row(
         f"late policy ticks in {SECONDS * TURNS} s, {words}",
-        f"{late} of {ticks}{', stopped by ' + ', '.join(faults) if faults else ''}",
+        f"{late} of {ticks}{', the gate answered with ' + ', '.join(faults) if faults else ''}",
         target="0" if tuned else "",
         met=late == 0 and not faults if tuned else None,
         figures={"late": late, "ticks": ticks, "bus_late": sum(s["late_ticks"] for s in summaries), "faults": faults},

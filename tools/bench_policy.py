@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from bench_table import ROOT, Row, interleaved
-from bench_walk import adopted
+from bench_walk import G1, adopted
 
 from sim2real.policy import Policy, load_policy
 
@@ -15,7 +15,7 @@ FACTOR = 1.3  # how much slower than the bare call we may be
 
 def rows() -> Iterator[Row]:
     """Every policy shipped, and an adopted one."""
-    for path in [*sorted(ROOT.glob("policies/*/*.onnx")), adopted()]:
+    for path in [*sorted(ROOT.glob("policies/*/*.onnx")), adopted(G1)]:
         yield overhead(load_policy(path))
 
 

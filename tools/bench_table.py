@@ -79,12 +79,12 @@ def sim2real(*argv: object) -> subprocess.CompletedProcess[str]:
     return done
 
 
-def deploy(*argv: object, record: Path | None = None) -> dict[str, Any]:
-    """Run ``sim2real deploy --robot g1`` and return its summary. The record is kept only where ``record`` says."""
+def deploy(*argv: object, robot: str = "g1", record: Path | None = None) -> dict[str, Any]:
+    """Run ``sim2real deploy`` and return its summary. The record is kept only where ``record`` says."""
     with tempfile.TemporaryDirectory() as directory:
         summary = Path(directory) / "summary.json"
         record = record or Path(directory) / "run.mcap"
-        sim2real("deploy", "--robot", "g1", "--json", summary, "--record", record, *argv)
+        sim2real("deploy", "--robot", robot, "--json", summary, "--record", record, *argv)
         return json.loads(summary.read_text())
 
 

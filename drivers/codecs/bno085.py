@@ -15,7 +15,7 @@ Source: CEVA, "BNO08X Data Sheet" (1000-3927), 1.3.5.2 UART-RVC protocol, with t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -135,9 +135,11 @@ class Sensor:
     def __init__(self) -> None:
         self._index = 0
 
-    def pack(self, time: float, orientation: np.ndarray, spin: np.ndarray, acceleration: np.ndarray) -> bytes:
+    def pack(
+        self, time: float, orientation: Sequence[float], spin: Sequence[float], acceleration: Sequence[float]
+    ) -> bytes:
         self._index = self._index + 1 & 0xFF
-        return pack(self._index, orientation, acceleration)
+        return pack(self._index, np.asarray(orientation), np.asarray(acceleration))
 
     def retell(self, packet: bytes, change: Callable[[bytearray], None]) -> bytes:
         payload = bytearray(packet[2:-4])  # not the reserved bytes

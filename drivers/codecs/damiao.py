@@ -176,7 +176,7 @@ def timeout_ticks(seconds: float) -> int:
     return max(1, round(seconds / TIMEOUT_TICK))
 
 
-def ranges_of(motors: tuple[MotorSpec, ...]) -> Ranges:
+def ranges_of(motors: Sequence[MotorSpec]) -> Ranges:
     """Full scales of ``motors`` by their model. Raises BusError for a model that is not in MODELS."""
     for m in motors:
         if m.model not in MODELS:
@@ -197,9 +197,52 @@ def _row_of(ids: np.ndarray) -> np.ndarray:
     return table
 
 
-class DamiaoCodec:
+class DamiaoTick:
+    """The host's side of a tick, for motors on one or more buses (a ``can_bus.TickCodec``)."""
+
+    def __init__(self, motors: Sequence[MotorSpec]) -> None:
+        """Raises BusError for an unknown model."""
+        self.mit = MitCodec(ranges_of(motors))
+        self._ids = np.array([m.id for m in motors], np.uint32)
+        self._nibbles = (self._ids & 0xF).astype(np.uint8)
+        self._feedback_ids = np.array([m.feedback_id for m in motors], np.uint32)
+
+    def pack_command(self, command: MotorCommand) -> np.ndarray:
+        """One MIT command for each motor (FRAME, (n,)). Saturates; raises ValueError for a value not finite."""
+        c = command
+        return make_frames(self._ids, self.mit.pack_command(c.position, c.velocity, c.kp, c.kd, c.torque))
+
+    def unpack_whole(self, frames: np.ndarray, state: MotorState, now: float) -> bool:
+        """Put ``frames`` into ``state`` if they are feedback of every motor in turn, as in nearly every tick."""
+        if len(frames) != len(self._ids):
+            return False
+        data = frames["data"]
+        fits = (frames["id"] == self._feedback_ids) & (frames["length"] == 8) & (data[:, 0] & 0xF == self._nibbles)
+        fits &= data[:, 1] != 0  # else it may be an answer on the register channel: ids are below 0x100
+        if np.count_nonzero(fits) < len(frames):
+            return False
+        self._take(data, slice(None), None, state, now)
+        return True
+
+    def _take(
+        self, data: np.ndarray, rows: np.ndarray | slice, index: np.ndarray | None, state: MotorState, now: float
+    ) -> None:
+        """Put feedback (m, 8) of motors ``rows`` into ``state``; ``index``: as of MitCodec."""
+        f = self.mit.unpack_feedback(data, index)
+        status = data[:, 0] >> 4
+        state.position[rows] = f.position
+        state.velocity[rows] = f.velocity
+        state.torque[rows] = f.torque
+        state.temperature[rows] = np.maximum(f.byte6, f.byte7)
+        state.enabled[rows] = status == 1
+        state.error[rows] = np.where(status > 1, status, 0)
+        state.time[rows] = now
+
+
+class DamiaoCodec(DamiaoTick):
     """The host's side of one bus: frames for its motors, and what their answers say (a ``can_bus.CanCodec``)."""
 
+    TICK = DamiaoTick
     # Bits of one command and its answer on the wire, inter-frame space included: the mean of MIT traffic, and the most
     # that bit stuffing makes of twice 8 bytes with an 11-bit identifier.
     TICK_BITS = (117.6 + 115.0, 135.0 + 135.0)
@@ -209,14 +252,10 @@ class DamiaoCodec:
     def __init__(self, spec: BusSpec) -> None:
         """Raises BusError for an unknown model, or identifiers by which the motors could not be told apart."""
         _check_ids(spec)
+        super().__init__(spec.motors)
         n = len(spec.motors)
-        ranges = ranges_of(spec.motors)
-        self.mit = MitCodec(ranges)
-        self.checks = _checks(spec, ranges)
+        self.checks = _checks(spec, ranges_of(spec.motors))
         self._spec = spec
-        self._ids = np.array([m.id for m in spec.motors], np.uint32)
-        self._nibbles = (self._ids & 0xF).astype(np.uint8)
-        self._feedback_ids = np.array([m.feedback_id for m in spec.motors], np.uint32)
         self._row_of = _row_of(self._feedback_ids)
         refresh = np.array([pack_register(m.id, Operation.REFRESH) for m in spec.motors])
         self._refresh = make_frames(np.full(n, BROADCAST_ID), refresh)
@@ -224,11 +263,6 @@ class DamiaoCodec:
             kind: make_frames(self._ids, np.tile(special_payload(kind), (n, 1)))
             for kind in (Kind.CLEAR_ERROR, Kind.ENABLE, Kind.DISABLE)
         }
-
-    def pack_command(self, command: MotorCommand) -> np.ndarray:
-        """One MIT command for each motor (FRAME, (n,)). Saturates; raises ValueError for a value not finite."""
-        c = command
-        return make_frames(self._ids, self.mit.pack_command(c.position, c.velocity, c.kp, c.kd, c.torque))
 
     def pack_enable(self, state: MotorState) -> np.ndarray:
         """Enable frames, each behind a "clear error" where ``state`` shows one: a motor with an error stays off."""
@@ -261,35 +295,17 @@ class DamiaoCodec:
     def unpack(self, frames: np.ndarray, state: MotorState, now: float) -> int:
         """Put the feedback among ``frames`` into ``state``, the latest of each motor last. Returns how many frames came
         from nobody on this bus or were malformed; answers on the register channel are neither."""
-        data, rows, index, strangers = frames["data"], slice(None), None, 0
-        if not self._is_one_each(frames):
-            owners, answers, unknown = self._sort(frames)
-            feedback = ~(answers | unknown)
-            data, rows, strangers = data[feedback], owners[feedback], int(np.count_nonzero(unknown))
-            index = rows
-        f = self.mit.unpack_feedback(data, index)
-        status = data[:, 0] >> 4
-        state.position[rows] = f.position
-        state.velocity[rows] = f.velocity
-        state.torque[rows] = f.torque
-        state.temperature[rows] = np.maximum(f.byte6, f.byte7)
-        state.enabled[rows] = status == 1
-        state.error[rows] = np.where(status > 1, status, 0)
-        state.time[rows] = now
-        return strangers
+        if self.unpack_whole(frames, state, now):
+            return 0
+        owners, answers, strangers = self._sort(frames)
+        feedback = ~(answers | strangers)
+        rows = owners[feedback]
+        self._take(frames["data"][feedback], rows, rows, state, now)
+        return int(np.count_nonzero(strangers))
 
     def owners(self, frames: np.ndarray) -> np.ndarray:
         """Whose each of ``frames`` is, by its identifier: (m,) rows of the motors, -1 for nobody on this bus."""
         return self._row_of[np.minimum(frames["id"], 0x800)]
-
-    def _is_one_each(self, frames: np.ndarray) -> bool:
-        """Whether ``frames`` are feedback of every motor in turn, as in nearly every tick: what _sort finds, cheaper."""
-        if len(frames) != len(self._ids):
-            return False
-        data = frames["data"]
-        fits = (frames["id"] == self._feedback_ids) & (frames["length"] == 8) & (data[:, 0] & 0xF == self._nibbles)
-        fits &= data[:, 1] != 0  # else it may be an answer on the register channel: ids are below 0x100
-        return np.count_nonzero(fits) == len(frames)
 
     def _sort(self, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Whose each frame is (m,), which are answers on the register channel (m,), and which nobody's (m,).

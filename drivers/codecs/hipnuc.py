@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import binascii
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -22,21 +23,12 @@ HEAD_SIZE = 6
 LENGTH_MAX = 512  # bytes of payload; the sensor's largest packet is well below
 TAG = 0x91
 
-PAYLOAD = np.dtype(
-    [
-        ("tag", "u1"),
-        ("status", "<u2"),
-        ("temperature", "i1"),  # deg C
-        ("pressure", "<f4"),  # Pa
-        ("timestamp", "<u4"),  # ms since power-on
-        ("acceleration", "<f4", (3,)),  # g
-        ("angular_velocity", "<f4", (3,)),  # deg/s
-        ("magnetic_field", "<f4", (3,)),  # uT
-        ("roll_pitch_yaw", "<f4", (3,)),  # deg
-        ("orientation", "<f4", (4,)),  # w, x, y, z
-    ]
-)  # 76 bytes, packed
-HEADER = np.dtype([("head", "u1", (2,)), ("length", "<u2"), ("crc", "<u2")])
+# tag u8, status u16, temperature i8 (deg C), pressure f32 (Pa), timestamp u32 (ms since power-on), then f32 vectors:
+# acceleration (g), angular velocity (deg/s), magnetic field (uT), roll, pitch, yaw (deg), orientation (w, x, y, z)
+PAYLOAD = struct.Struct("<BHbfI3f3f3f3f4f")  # 76 bytes
+
+
+Vector: TypeAlias = Any  # np.ndarray, or to ``pack`` any sequence of floats
 
 
 class Hi91(NamedTuple):
@@ -44,9 +36,9 @@ class Hi91(NamedTuple):
 
     timestamp: float  # s since the sensor's power-on
     temperature: float  # deg C
-    acceleration: np.ndarray  # (3,) m/s^2, +g upwards at rest
-    angular_velocity: np.ndarray  # (3,) rad/s
-    orientation: np.ndarray  # (4,) w, x, y, z
+    acceleration: Vector  # (3,) m/s^2, +g upwards at rest
+    angular_velocity: Vector  # (3,) rad/s
+    orientation: Vector  # (4,) w, x, y, z
     status: int
 
 
@@ -57,23 +49,22 @@ def crc16(data: bytes, crc: int = 0) -> int:
 
 def pack(packet: Hi91) -> bytes:
     """The packet as the sensor sends it (82 bytes)."""
-    payload = np.zeros(1, PAYLOAD)
-    payload["tag"] = TAG
-    payload["status"] = packet.status
-    payload["temperature"] = round(packet.temperature)
-    payload["timestamp"] = round(packet.timestamp * 1e3) & 0xFFFF_FFFF
-    payload["acceleration"] = np.asarray(packet.acceleration) / GRAVITY
-    payload["angular_velocity"] = np.rad2deg(packet.angular_velocity)
     w, x, y, z = packet.orientation
-    payload["roll_pitch_yaw"] = np.rad2deg(
-        [
-            math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-            math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
-            math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-        ]
+    payload = PAYLOAD.pack(
+        TAG,
+        packet.status,
+        round(packet.temperature),
+        0.0,
+        round(packet.timestamp * 1e3) & 0xFFFF_FFFF,
+        *(a / GRAVITY for a in packet.acceleration),
+        *map(math.degrees, packet.angular_velocity),
+        *(0.0, 0.0, 0.0),
+        math.degrees(math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))),
+        math.degrees(math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))),
+        math.degrees(math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))),
+        *(w, x, y, z),
     )
-    payload["orientation"] = packet.orientation
-    return frame(payload.tobytes())
+    return frame(payload)
 
 
 def frame(payload: bytes) -> bytes:
@@ -84,16 +75,18 @@ def frame(payload: bytes) -> bytes:
 
 def unpack(payload: bytes) -> Hi91:
     """A checked payload whose first byte is TAG, in SI units. Raises ValueError if it is shorter than PAYLOAD."""
-    p = np.frombuffer(payload, PAYLOAD, count=1)[0]
-    with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN
-        return Hi91(
-            timestamp=float(p["timestamp"]) * 1e-3,
-            temperature=float(p["temperature"]),
-            acceleration=p["acceleration"].astype(float) * GRAVITY,
-            angular_velocity=np.deg2rad(p["angular_velocity"].astype(float)),
-            orientation=p["orientation"].astype(float),
-            status=int(p["status"]),
-        )
+    if len(payload) < PAYLOAD.size:
+        raise ValueError(f"payload: got {len(payload)} bytes, expected {PAYLOAD.size}")
+    _, status, temperature, _, timestamp, *vectors = PAYLOAD.unpack_from(payload)
+    v = np.array(vectors)
+    return Hi91(
+        timestamp=timestamp * 1e-3,
+        temperature=float(temperature),
+        acceleration=v[0:3] * GRAVITY,
+        angular_velocity=np.deg2rad(v[3:6]),
+        orientation=v[12:16],
+        status=status,
+    )
 
 
 class Parser:
@@ -126,7 +119,7 @@ class Parser:
                 self.rejected += 1
                 at += len(HEAD)  # what looked like a header may hide a real one: search on right behind it
                 continue
-            if payload[0] == TAG and length >= PAYLOAD.itemsize:
+            if payload[0] == TAG and length >= PAYLOAD.size:
                 packets.append(unpack(payload))
             at = end
         else:
@@ -140,7 +133,9 @@ class Sensor:
 
     RATE_MAX = 1000.0  # Hz
 
-    def pack(self, time: float, orientation: np.ndarray, spin: np.ndarray, acceleration: np.ndarray) -> bytes:
+    def pack(
+        self, time: float, orientation: Sequence[float], spin: Sequence[float], acceleration: Sequence[float]
+    ) -> bytes:
         return pack(Hi91(time, 40.0, acceleration, spin, orientation, 0))
 
     def retell(self, packet: bytes, change: Callable[[bytearray], None]) -> bytes:

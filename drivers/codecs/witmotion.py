@@ -13,7 +13,7 @@ Source: docs.wit-motion.com, HWT905-TTL "Protocol": output data format, and regi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -103,8 +103,10 @@ class Sensor:
 
     RATE_MAX = 200.0  # Hz
 
-    def pack(self, time: float, orientation: np.ndarray, spin: np.ndarray, acceleration: np.ndarray) -> bytes:
-        return pack(Sample(acceleration, spin, orientation, 40.0))
+    def pack(
+        self, time: float, orientation: Sequence[float], spin: Sequence[float], acceleration: Sequence[float]
+    ) -> bytes:
+        return pack(Sample(np.asarray(acceleration), np.asarray(spin), np.asarray(orientation), 40.0))
 
     def retell(self, packet: bytes, change: Callable[[bytearray], None]) -> bytes:
         frames = [packet[at : at + SIZE] for at in range(0, len(packet), SIZE)]

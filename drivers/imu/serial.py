@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 import numpy as np
@@ -70,5 +71,5 @@ class SerialImu:
         self._wire.close()
 
     def _plausible(self, p: ImuPacket) -> bool:
-        finite = np.isfinite(p.angular_velocity).all() and np.isfinite(p.acceleration).all()
-        return bool(finite and abs(np.linalg.norm(p.orientation) - 1.0) < NORM_TOLERANCE)
+        measured = (*p.angular_velocity.tolist(), *p.acceleration.tolist())
+        return all(map(math.isfinite, measured)) and abs(math.hypot(*p.orientation.tolist()) - 1.0) < NORM_TOLERANCE

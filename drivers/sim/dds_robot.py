@@ -40,6 +40,7 @@ class SimG1:
         n = len(spec.motors)
         self.spec, self.mode_machine, self.controller, self.stubborn = spec, mode_machine, controller, stubborn
         self.joints = [m.joint for m in spec.motors]
+        self.bus_names = [spec.name] * n
         self.log: list[MotorEvent] = []
         self.enabled = np.zeros(n, bool)
         self.powered = [True] * n

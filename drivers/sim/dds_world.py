@@ -6,13 +6,10 @@ travels between the host and the robot, by bus, or as ``imu`` what the IMU's rea
 
 from __future__ import annotations
 
-import hashlib
-import math
 import random
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from heapq import heappop, heappush
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +21,6 @@ from drivers.sim.dds_port import DdsPort
 from drivers.sim.dds_robot import SimG1, only_bus
 from drivers.sim.faults import IMU, POWER, Fault, parse_fault
 from drivers.sim.imu import ImuNoise, multiply
-from drivers.sim.plant import Plant
 from drivers.sim.wire import TOLERANCE
 from drivers.sim.world import World
 from drivers.wire import WireError
@@ -67,53 +63,35 @@ class Link:
 
 
 class DdsWorld(World):
-    """A G1 in MuJoCo behind simulated DDS. Arguments as for World; ``robot``: what else SimG1 takes.
+    """A G1 in MuJoCo behind simulated DDS. Arguments as for World."""
 
-    ``others``: how many other programs publish LowCmd, as far as a host can see (they say nothing here).
-    """
+    def _check(self, buses: Sequence[BusSpec]) -> None:
+        only_bus(buses)
 
-    def __init__(
+    def _wire(
         self,
-        model_path: str | Path,
-        base: str,
         buses: Sequence[BusSpec],
         imu: ImuSpec,
+        seed: int,
         *,
-        timestep: float = 0.002,
-        seed: int = 0,
-        faults: Sequence[Fault | str] = (),
-        prepare: Callable[[Any], None] | None = None,
-        joint_pos: Mapping[str, float] | None = None,
-        hang: float | None = 0.01,
-        noise: float = 0.0,
         imu_noise: ImuNoise | None = None,
         latency: float = 250e-6,
         others: int = 0,
         **robot: Any,
-    ):
-        spec = only_bus(buses)
-        joints = [m.joint for m in spec.motors]
-        self.time = 0.0
-        self.plant = Plant(model_path, joints, base, timestep, prepare, imu.site)
-        self.plant.reset(joint_pos, hang=hang, noise=noise, seed=seed)
-        self.motors = SimG1(spec, self.plant, **robot)  # type: ignore[assignment]
-        self.buses = []
-        self.others = others
-        self.imu = StatePublisher(self, imu, seed, imu_noise or ImuNoise())  # type: ignore[assignment]
+    ) -> None:
+        """``robot``: what else SimG1 takes. ``others``: how many other programs publish LowCmd, as far as a host can see
+        (they say nothing here)."""
+        (spec,) = buses
+        self.motors = SimG1(spec, self.plant, **robot)
+        self.others, self.latency = others, latency
         self.up = Link(f"{seed}/{spec.name}/up")  # from the host to the robot
         self._down = {spec.name: SimDdsWire(self, f"{seed}/{spec.name}/down"), IMU: SimDdsWire(self, f"{seed}/{IMU}")}
-        self.wires = {spec.name: self._down[spec.name]}  # type: ignore[assignment]
+        self.imu = StatePublisher(self, imu, seed, imu_noise or ImuNoise())
+        self.wires = {spec.name: self._down[spec.name]}
         self.ports = {spec.name: DdsPort(self, self._down[spec.name])}
-        self.imu_wire = StateStream(self._down[IMU])  # type: ignore[assignment]
-        self.latency = latency
-        self._timestep = timestep
-        self._substeps = 0
-        self._sha = hashlib.sha256()
-        self._power = []
+        self.imu_wire = StateStream(self._down[IMU])
         self._travelling: list[tuple[float, int, str, bytes]] = []  # heap of (arrival, order, topic, payload)
         self._sent = self._published = 0
-        for fault in faults:
-            self.inject(fault)
 
     def send(self, topic: str, payload: bytes, now: float) -> None:
         """A sample leaves the host at ``now``."""
@@ -133,8 +111,8 @@ class DdsWorld(World):
         while self._travelling and self._travelling[0][0] <= until + TOLERANCE:
             time, _, topic, payload = heappop(self._travelling)
             self._sha.update(topic.encode() + payload)
-            for answer in self.motors.receive(topic, payload, time):
-                self.publish(*answer, time)
+            for of, answer in self.motors.receive(topic, payload, time):
+                self.publish(of, answer, time)
 
     @property
     def busy(self) -> bool:
@@ -143,30 +121,23 @@ class DdsWorld(World):
     def inject(self, fault: Fault | str) -> None:
         """Make something go wrong. Raises BusError for a fault that DDS does not have, or that befalls nothing here."""
         fault = parse_fault(fault) if isinstance(fault, str) else fault
-        name, joints = self.motors.spec.name, self.motors.joints
         if fault.kind not in FAULTS:
             raise BusError(f"fault: got kind '{fault.kind}', expected one that DDS can have: {', '.join(FAULTS)}")
         if fault.bus == IMU:
             self._down[IMU].link.faults.append(fault)
-            return
-        rows = [row for row, joint in enumerate(joints) if fault.befalls(name, joint)]
-        if not rows:
-            raise BusError(
-                f"fault '{fault.kind}': nothing here is '{fault.bus}/{fault.motor}', expected {name} or {IMU} and, after a "
-                "slash, one of its joints"
-            )
-        if fault.kind in POWER:
-            back = fault.start + fault.value if fault.kind == "reboot" else fault.end
-            for row in rows:
-                heappush(self._power, (fault.start, len(self._power), row, False))
-                if back < math.inf:
-                    heappush(self._power, (back, len(self._power), row, True))
-        elif fault.motor != "*":
-            raise BusError(f"fault '{fault.kind}': a sample holds all motors; expected '{fault.kind}:{name}'")
         else:
-            self._down[name].link.faults.append(fault)
-            if fault.kind != "stuck":  # of what the robot says
-                self.up.faults.append(fault)
+            super().inject(fault)
+
+    def _befall(self, fault: Fault, rows: list[int]) -> None:
+        if fault.kind in POWER:
+            super()._befall(fault, rows)
+            return
+        name = self.motors.spec.name
+        if fault.motor != "*":
+            raise BusError(f"fault '{fault.kind}': a sample holds all motors; expected '{fault.kind}:{name}'")
+        self._down[name].link.faults.append(fault)
+        if fault.kind != "stuck":  # of what the robot says
+            self.up.faults.append(fault)
 
     def counters(self) -> dict[str, dict[str, float]]:
         """By bus: samples sent to the robot, published by it, and lost or damaged between."""

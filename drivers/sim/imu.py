@@ -7,6 +7,7 @@ scale errors, vibration, saturation, temperature.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import random
 from collections import deque
@@ -30,7 +31,9 @@ class Sensor(Protocol):
 
     RATE_MAX: float  # Hz
 
-    def pack(self, time: float, orientation: np.ndarray, spin: np.ndarray, acceleration: np.ndarray) -> bytes:
+    def pack(
+        self, time: float, orientation: Sequence[float], spin: Sequence[float], acceleration: Sequence[float]
+    ) -> bytes:
         """A sample as it is sent: s, (4,) w, x, y, z, (3,) rad/s and (3,) m/s^2 in the sensor's own frame."""
         ...
 
@@ -88,15 +91,20 @@ class SimImu:
         at = self._samples % BLOCK
         if at == 1 or self._samples == 1:
             self._block = self._generator.standard_normal((BLOCK, 9)) * self._scale + self._mean
-        body, noise = self._body, self._block[at]
+        body, noise = self._body, self._block[at].tolist()
         orientation = body.orientation_imu_in_world.tolist()
         spin, acceleration = body.angular_velocity_imu_in_imu, body.acceleration_imu_in_imu
         if self._mount is not None:
             orientation = multiply(orientation, self._mount)
             spin, acceleration = self._axes.T @ spin, self._axes.T @ acceleration
-        w, x, y, z = multiply(orientation, (1.0, *noise[:3].tolist()))
+        w, x, y, z = multiply(orientation, (1.0, *noise[:3]))
         norm = math.sqrt(w * w + x * x + y * y + z * z)
-        packet = self._sensor.pack(now, np.array([w, x, y, z]) / norm, spin + noise[3:6], acceleration + noise[6:9])
+        packet = self._sensor.pack(
+            now,
+            [w / norm, x / norm, y / norm, z / norm],
+            [a + b for a, b in zip(spin.tolist(), noise[3:6], strict=True)],
+            [a + b for a, b in zip(acceleration.tolist(), noise[6:9], strict=True)],
+        )
         self._send(packet, now)
 
     def _send(self, packet: bytes, now: float) -> None:
@@ -135,6 +143,12 @@ class SimImu:
 
     def inject(self, fault: Fault) -> None:
         self._faults.append(fault)
+
+    def digest(self, sha: hashlib._Hash) -> None:
+        """Add the packets carried since the last call."""
+        if self.carried:
+            sha.update(b"imu:" + b"".join(self.carried))
+            self.carried.clear()
 
     def read(self, now: float) -> bytes:
         """The bytes that have arrived by ``now``."""

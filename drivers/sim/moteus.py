@@ -84,7 +84,7 @@ class SimMoteus(SimMotors):
         self._codec = MoteusMotors(BusSpec("all", "moteus", motors))
         self.mode = [Mode.STOPPED] * n
         self._command = np.zeros((6, n))
-        self._since = np.zeros(n)  # s, when it came
+        self._came = np.zeros(n)  # s, when it did
         self._now = 0.0
         self._typed, self._says = [b""] * n, [b""] * n  # consoles: a line not yet whole, what is not yet fetched
         super().__init__(buses, body, frame_bits, **options)
@@ -191,12 +191,11 @@ class SimMoteus(SimMotors):
             if not np.isfinite(asked[:MOST]).all():
                 return  # a device would go wild; a simulation would only end
             self._command[:, row] = asked
-            self._since[row] = self.last_command_time[row] = self._fed[row] = time
+            self._came[row] = self._since[row] = self.last_command_time[row] = self._fed[row] = time
             timeout = written.get(Register.COMMAND_TIMEOUT, 0.0)
             timeout = self._registers[row]["servo.default_timeout_s"] if timeout == 0.0 else timeout
             self._timeout[row] = np.inf if np.isnan(timeout) else timeout
             self._set_mode(row, Mode(int(mode)), time, "enabled")
-            self._taken.append((row, time))
             self._commanded[row] = self._changed = True
             self._set_deadline()
 
@@ -223,7 +222,7 @@ class SimMoteus(SimMotors):
         self._body.limit(np.fmin(self._peak(), np.maximum(most, 0.0)))
         scale = np.where(timed_out, 1.0, c[KD])
         return MotorCommand(
-            (c[P] + c[V] * np.maximum(self._now - self._since, 0.0)) * TURN,
+            (c[P] + c[V] * np.maximum(self._now - self._came, 0.0)) * TURN,
             c[V] * TURN * in_position,
             kp * c[KP] * in_position,
             kd * scale * (in_position | damps) + SHORTED_DAMPING * (does == Mode.BRAKE),

@@ -129,9 +129,10 @@ class SimMotors:
         self._law = np.zeros((3, n))  # bias, kp, kd at the joints
         self._changed = False  # the law is no longer what commands and states make of it
         self._settle = False  # the body still has the mean of two laws
-        self._taken: list[tuple[int, float]] = []  # commands (row, time) of this substep
+        self._since = np.full(n, -np.inf)  # s, when each took its last command over
         self._arrived: list[tuple[int, bytes, float]] = []  # commands not yet taken over
-        self._deadline = np.inf
+        self._deadline = np.inf  # s, before which no watchdog trips
+        self._shortest = np.inf  # s, of all watchdogs
         self._thermal_due = THERMAL_PERIOD
         self._stale = True
         self._feedback = b""
@@ -226,11 +227,7 @@ class SimMotors:
         self._take_commands()
         if self._changed:
             old, new = self._law, self._decide()
-            share = np.ones(len(self.specs))
-            if self._taken:
-                rows, times = zip(*self._taken, strict=True)
-                share[list(rows)] = np.clip((end - np.array(times)) / (end - start), 0.0, 1.0)
-                self._taken.clear()
+            share = np.minimum((end - self._since) / (end - start), 1.0)  # of the substep, under the new law
             self._body.drive(*(old + share * (new - old)))
             self._law, self._changed, self._settle = new, False, True
         elif self._settle:
@@ -247,9 +244,9 @@ class SimMotors:
         self.last_command_time[rows] = times
         self._fed[rows] = times
         self._commanded[rows] = True
-        self._taken += zip(rows, times, strict=True)
+        self._since[rows] = times
         self._changed = True
-        self._set_deadline()
+        self._deadline = min(self._deadline, min(times) + self._shortest)
 
     def _decide(self) -> np.ndarray:
         """The law (3, n) that the motors' targets and states make: bias, kp, kd at the joints."""
@@ -340,3 +337,4 @@ class SimMotors:
     def _set_deadline(self) -> None:
         due = self._fed[self.enabled] + self._timeout[self.enabled]
         self._deadline = float(due.min()) if len(due) else np.inf
+        self._shortest = float(self._timeout.min())

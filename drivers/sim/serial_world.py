@@ -6,18 +6,15 @@ line is served to other processes: SerialPort. For other programs, servos withou
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from drivers.bus import BusError, BusSpec, ImuSpec
 from drivers.open import PROTOCOLS, load
-from drivers.sim.faults import IMU, Fault, parse_fault
-from drivers.sim.imu import ImuNoise, SimImu, SimSerialWire
+from drivers.sim.faults import Fault
+from drivers.sim.imu import ImuNoise
 from drivers.sim.motor import MotorEvent
 from drivers.sim.plant import Plant
 from drivers.sim.serial_line import GAP, SerialLine, SerialLineWire
@@ -27,85 +24,51 @@ from drivers.wire import WireError
 
 
 class SerialWorld(World):
-    """A robot in MuJoCo behind simulated serial lines. Arguments as for World; ``gap``: see serial_line.py; ``fast`` and
-    ``patient``: see SimServos."""
+    """A robot in MuJoCo behind simulated serial lines. Arguments as for World."""
 
-    def __init__(
+    def _check(self, buses: Sequence[BusSpec]) -> None:
+        known = [name for name, p in PROTOCOLS.items() if p.wire == "serial" and p.motors]
+        if strangers := sorted({b.protocol for b in buses} - set(known)):
+            raise BusError(
+                f"no emulated servos for {', '.join(strangers)} on a serial line; expected {' or '.join(known)} on every bus"
+            )
+
+    def _wire(
         self,
-        model_path: str | Path,
-        base: str,
         buses: Sequence[BusSpec],
         imu: ImuSpec,
+        seed: int,
         *,
-        timestep: float = 0.002,
-        seed: int = 0,
-        faults: Sequence[Fault | str] = (),
-        prepare: Callable[[Any], None] | None = None,
-        joint_pos: Mapping[str, float] | None = None,
-        hang: float | None = 0.01,
-        noise: float = 0.0,
         registers: Mapping[str, Mapping[str, int]] | None = None,
         imu_noise: ImuNoise | None = None,
         latency: float = 250e-6,
         gap: float = GAP,
         fast: bool = True,
         patient: bool = False,
-    ):
-        known = [name for name, p in PROTOCOLS.items() if p.wire == "serial" and p.motors]
-        if strangers := sorted({b.protocol for b in buses} - set(known)):
-            raise BusError(
-                f"no emulated servos for {', '.join(strangers)} on a serial line; expected {' or '.join(known)} on every bus"
-            )
-        joints = [m.joint for b in buses for m in b.motors]
-        if unknown := sorted(set(registers or {}) - set(joints)):
-            raise BusError(f"registers: got joints {unknown}, expected some of {', '.join(joints)}")
-        self.time = 0.0
-        self.plant = Plant(model_path, joints, base, timestep, prepare, imu.site)
-        self.plant.reset(joint_pos, hang=hang, noise=noise, seed=seed)
-        self.motors = AllServos(buses, self.plant, registers or {}, fast, patient)  # type: ignore[assignment]
+    ) -> None:
+        """``gap``: see serial_line.py; ``fast`` and ``patient``: see SimServos."""
+        self.motors = AllServos(buses, self.plant, registers or {}, fast, patient)
         self.lines = [
             SerialLine(servos.spec, servos, seed=seed, latency=latency, gap=gap) for servos in self.motors.buses
         ]
-        self.buses = []
-        self.imu = SimImu(imu, self.plant, seed=seed, noise=imu_noise, latency=latency)
-        now = lambda: self.time  # noqa: E731
-        self.wires = {line.spec.name: SerialLineWire(line, now) for line in self.lines}  # type: ignore[assignment]
+        self.wires = {line.spec.name: SerialLineWire(line, self.now) for line in self.lines}
         self.ports = {line.spec.name: SerialPort(line) for line in self.lines}
-        self.imu_wire = SimSerialWire(self.imu, now)
-        self._timestep = timestep
-        self._substeps = 0
-        self._sha = hashlib.sha256()
-        self._power = []  # the lines switch power themselves
-        for fault in faults:
-            self.inject(fault)
+        self._wire_imu(imu, seed, imu_noise, latency)
 
     def _carry(self, until: float) -> None:
         for line in self.lines:
             line.carry(until)
             line.digest(self._sha)
-        if self.imu.carried:
-            self._sha.update(b"imu:" + b"".join(self.imu.carried))
-            self.imu.carried.clear()
+        self.imu.digest(self._sha)
 
     @property
     def busy(self) -> bool:
         return any(line.busy for line in self.lines)
 
-    def inject(self, fault: Fault | str) -> None:
-        """Make something go wrong. Raises BusError for a fault that befalls nothing here."""
-        fault = parse_fault(fault) if isinstance(fault, str) else fault
-        if fault.bus == IMU:
-            self.imu.inject(fault)
-            return
-        struck = [li for li in self.lines if any(fault.befalls(li.spec.name, j) for j in li.servos.joints)]
-        if not struck:
-            names = ", ".join([*(line.spec.name for line in self.lines), IMU])
-            raise BusError(
-                f"fault '{fault.kind}': nothing here is '{fault.bus}/{fault.motor}', expected one of the buses {names} "
-                "and, after a slash, one of its joints"
-            )
-        for line in struck:
-            line.inject(fault)
+    def _befall(self, fault: Fault, rows: list[int]) -> None:
+        """Every line lets it befall its own; it also switches their power, at the very time."""
+        for bus in dict.fromkeys(self.motors.bus_names[row] for row in rows):
+            next(line for line in self.lines if line.spec.name == bus).inject(fault)
 
     def counters(self) -> dict[str, dict[str, float]]:
         """By bus: see serial_line.Traffic, and ``load``, the share of all time so far that the line was taken."""
@@ -129,6 +92,9 @@ class AllServos:
         patient: bool,
     ):
         self.joints = [m.joint for b in buses for m in b.motors]
+        self.bus_names = [b.name for b in buses for _ in b.motors]
+        if unknown := sorted(set(registers) - set(self.joints)):
+            raise BusError(f"registers: got joints {unknown}, expected some of {', '.join(self.joints)}")
         self.log: list[MotorEvent] = []
         self.buses: list[TableServos] = []
         shared = np.zeros((4, len(self.joints)))

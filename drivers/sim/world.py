@@ -34,14 +34,19 @@ from drivers.sim.wire import QUEUE_LENGTH, TOLERANCE, SimCan, SimCanWire
 
 
 class World:
-    """A robot in MuJoCo behind simulated wires.
+    """A robot in MuJoCo behind simulated wires: CAN buses, or what a derived class makes of them in ``_wire``.
 
     ``joint_pos``: where its joints start (by name, rad). ``hang``: metres of air under the feet while it hangs from the
     gantry at the start; None: it stands, without gantry. ``noise``: uniform, rad, on the starting joints.
-    ``faults``: Faults or their text form. ``registers`` and ``wrap``: see SimMotors. ``prepare``: see Plant.
+    ``faults``: Faults or their text form. ``prepare``: see Plant. ``wiring``: what ``_wire`` takes.
     """
 
+    motors: Any  # behind all buses, in their order
+    imu: Any  # samples the plant
+    wires: Mapping[str, Any]  # the host's ends, by bus
+    imu_wire: Any
     ports: Mapping[str, Any] = {}  # serve.Ports of what is no CAN bus
+    buses: Sequence[SimCan] = ()
 
     def __init__(
         self,
@@ -57,38 +62,58 @@ class World:
         joint_pos: Mapping[str, float] | None = None,
         hang: float | None = 0.01,
         noise: float = 0.0,
+        **wiring: Any,
+    ):
+        self._check(buses)
+        self.time = 0.0
+        self.plant = Plant(model_path, [m.joint for b in buses for m in b.motors], base, timestep, prepare, imu.site)
+        self.plant.reset(joint_pos, hang=hang, noise=noise, seed=seed)
+        self._timestep = timestep
+        self._substeps = 0  # done so far
+        self._sha = hashlib.sha256()
+        self._power: list[tuple[float, int, int, bool]] = []  # heap of (time, order, row, on)
+        self._wire(buses, imu, seed, **wiring)
+        for fault in faults:
+            self.inject(fault)
+
+    def _check(self, buses: Sequence[BusSpec]) -> None:
+        """Raise BusError for buses that have no emulation here."""
+        _motors_of(buses)
+
+    def _wire(
+        self,
+        buses: Sequence[BusSpec],
+        imu: ImuSpec,
+        seed: int,
+        *,
         registers: Mapping[str, Mapping[str, float]] | None = None,
         wrap: bool = False,
         imu_noise: ImuNoise | None = None,
         latency: float = 250e-6,
         reply_delay: float = 50e-6,
         queue_length: int = QUEUE_LENGTH,
-    ):
-        joints = [m.joint for b in buses for m in b.motors]
-        self.time = 0.0
-        self.plant = Plant(model_path, joints, base, timestep, prepare, imu.site)
-        self.plant.reset(joint_pos, hang=hang, noise=noise, seed=seed)
+    ) -> None:
+        """Put motors and IMU on the plant, and wires to them. ``registers`` and ``wrap``: see SimMotors."""
         self.motors = _motors_of(buses)(buses, self.plant, bits_of(buses[0]), registers=registers, wrap=wrap)
-        self.buses: list[SimCan] = []
-        first = 0
-        for i, spec in enumerate(buses):
-            self.buses.append(
-                SimCan(spec, i, first, self.motors, seed=seed, latency=latency, reply_delay=reply_delay,
-                       queue_length=queue_length)
-            )  # fmt: skip
-            first += len(spec.motors)
-        self.imu = SimImu(imu, self.plant, seed=seed, noise=imu_noise, latency=latency)
-        now = lambda: self.time  # noqa: E731
-        self.wires = {bus.spec.name: SimCanWire(bus, now) for bus in self.buses}
-        self.imu_wire = SimSerialWire(self.imu, now)
-        self._timestep = timestep
-        self._substeps = 0  # done so far
-        self._sha = hashlib.sha256()
-        self._power: list[tuple[float, int, int, bool]] = []  # heap of (time, order, row, on)
-        for fault in faults:
-            self.inject(fault)
+        firsts = np.cumsum([0, *(len(b.motors) for b in buses)]).tolist()
+        self.buses = [
+            SimCan(spec, i, firsts[i], self.motors, seed=seed, latency=latency, reply_delay=reply_delay,
+                   queue_length=queue_length)
+            for i, spec in enumerate(buses)
+        ]  # fmt: skip
+        self.wires = {bus.spec.name: SimCanWire(bus, self.now) for bus in self.buses}
+        self._wire_imu(imu, seed, imu_noise, latency)
+
+    def _wire_imu(self, spec: ImuSpec, seed: int, noise: ImuNoise | None, latency: float) -> None:
+        """An IMU on a serial line of its own."""
+        self.imu = SimImu(spec, self.plant, seed=seed, noise=noise, latency=latency)
+        self.imu_wire = SimSerialWire(self.imu, self.now)
 
     # -- time --------------------------------------------------------------------------------------------------------
+
+    def now(self) -> float:
+        """Simulated time (s)."""
+        return self.time
 
     def advance(self, until: float) -> None:
         """Let everything happen up to ``until`` (s). The plant moves in whole substeps; the wires exactly."""
@@ -117,9 +142,7 @@ class World:
             if not bus.idle:
                 bus.carry(until)
                 bus.digest(self._sha)
-        if self.imu.carried:
-            self._sha.update(b"imu:" + b"".join(self.imu.carried))
-            self.imu.carried.clear()
+        self.imu.digest(self._sha)
 
     def _price(self) -> None:
         """Give every frame that hosts sent its length on the wire, all in one pass."""
@@ -155,16 +178,18 @@ class World:
         if fault.bus == IMU:
             self.imu.inject(fault)
             return
-        rows = [
-            row for row, (bus, joint) in enumerate(zip(self.motors.bus_names, self.motors.joints, strict=True))
-            if fault.befalls(bus, joint)
-        ]  # fmt: skip
+        motors = enumerate(zip(self.motors.bus_names, self.motors.joints, strict=True))
+        rows = [row for row, (bus, joint) in motors if fault.befalls(bus, joint)]
         if not rows:
-            names = ", ".join([*(b.spec.name for b in self.buses), IMU])
+            names = ", ".join([*self.wires, IMU])
             raise BusError(
                 f"fault '{fault.kind}': nothing here is '{fault.bus}/{fault.motor}', expected one of the buses {names} "
                 "and, after a slash, one of its joints"
             )
+        self._befall(fault, rows)
+
+    def _befall(self, fault: Fault, rows: list[int]) -> None:
+        """Let a fault befall the motors ``rows`` and their buses."""
         if fault.kind in POWER:
             back = fault.start + fault.value if fault.kind == "reboot" else fault.end
             for row in rows:

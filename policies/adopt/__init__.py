@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 DIALECTS = {  # name -> module with read(source, configs, robot) -> Draft
+    "booster_gym": "policies.adopt.booster_gym",
+    "holosoma": "policies.adopt.holosoma",
+    "playground": "policies.adopt.playground",
     "unitree_rl_gym": "policies.adopt.unitree_rl_gym",
 }
 STEPS = 40  # of each golden sequence

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,11 +24,22 @@ IR_VERSION = 8
 
 
 def splice(
-    text: str, constants: Mapping[str, ArrayLike], axes: Mapping[str, Sequence[int]], network: ModelProto
+    body: str,
+    fields: Mapping[str, Any],
+    constants: Mapping[str, ArrayLike],
+    axes: Mapping[str, Sequence[int]],
+    network: ModelProto,
 ) -> ModelProto:
-    """The graph of ``text`` with ``constants`` (float32) and ``axes`` (int64) as weights and the nodes of ``network``
-    where it is called. Inputs and outputs of ``network`` are matched by position. Raises PolicyError if their numbers differ."""
+    """The graph of ``body`` between the inputs and outputs of the contract's ``fields``, with ``constants`` (float32) and
+    ``axes`` (int64) as weights and the nodes of ``network`` where it is called. Inputs and outputs of ``network`` are
+    matched by position. Raises PolicyError if their numbers differ."""
     import onnx
+
+    outside = [
+        ", ".join(f"float[{','.join(map(str, [1, *shape]))}] {name}" for name, shape in fields[side].items())
+        for side in ("inputs", "outputs")
+    ]
+    text = f"{fields['name']} ({outside[0]}) => ({outside[1]}) {{{body}}}"
 
     opset = next((e.version for e in network.opset_import if e.domain == ""), 0)
     if opset != OPSET:

@@ -6,20 +6,19 @@ drives the legs; the YAML of the real robot says how waist and arms are held. Jo
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from policies.adopt import Draft, Step
-from policies.adopt.lstm import rebuild_lstm
+from policies.adopt.rebuild import rebuild_lstm
+from policies.adopt.shipped import network_file, read_onnx, read_yaml
 from policies.adopt.splice import splice
+from policies.adopt.walking import GRAVITY, GRAVITY_CONSTANTS, gravity_in_base, run_shipped, walk_fields
 from sim2real.config import Positive, RobotConfig, Unsigned, explain
-from sim2real.graph import refuse_strange
 from sim2real.policy import PolicyError
 
 if TYPE_CHECKING:
@@ -43,31 +42,8 @@ MOTORS = {  # robot -> joint of each motor index of the maker's SDK
     )
 }
 
-GRAPH = """
-unitree_rl_gym (
-    float[1,{n}] joint_pos, float[1,{n}] joint_vel, float[1,4] orientation_base_in_world,
-    float[1,3] angular_velocity_base_in_base, float[1,3] command_velocity,
-    float[1,{n}] carry_action, float[1,{hidden}] carry_hidden, float[1,{hidden}] carry_cell, float[1,1] carry_step
-) => (
-    float[1,{n}] joint_pos_target, float[1,{size}] observation, float[1,{n}] action,
-    float[1,{n}] carry_action_next, float[1,{hidden}] carry_hidden_next, float[1,{hidden}] carry_cell_next,
-    float[1,1] carry_step_next
-) {{
+BODY = f"""{GRAVITY}
     gyro = Mul (angular_velocity_base_in_base, gyro_scale)
-    w, x, y, z = Split <axis = 1> (orientation_base_in_world)
-    wx = Mul (w, x)
-    wy = Mul (w, y)
-    xz = Mul (x, z)
-    yz = Mul (y, z)
-    xx = Mul (x, x)
-    yy = Mul (y, y)
-    wy_xz = Sub (wy, xz)
-    wx_yz = Add (wx, yz)
-    xx_yy = Add (xx, yy)
-    gravity_x = Mul (two, wy_xz)
-    gravity_y = Mul (minus_two, wx_yz)
-    twice_xx_yy = Mul (two, xx_yy)
-    gravity_z = Sub (twice_xx_yy, one)
     command = Mul (command_velocity, command_scale)
     deviation = Sub (joint_pos, default_joint_pos)
     position = Mul (deviation, position_scale)
@@ -75,8 +51,7 @@ unitree_rl_gym (
     phase = Mul (carry_step, phase_per_step)
     sine = Sin (phase)
     cosine = Cos (phase)
-    observation = Concat <axis = 1> (
-        gyro, gravity_x, gravity_y, gravity_z, command, position, velocity, carry_action, sine, cosine)
+    observation = Concat <axis = 1> (gyro, gravity, command, position, velocity, carry_action, sine, cosine)
     hidden = Unsqueeze (carry_hidden, layers)
     cell = Unsqueeze (carry_cell, layers)
     action, hidden_next, cell_next = Network (observation, hidden, cell)
@@ -87,7 +62,6 @@ unitree_rl_gym (
     carry_step_next = Mod <fmod = 1> (following, steps_per_gait)
     offset = Mul (action, action_scale)
     joint_pos_target = Add (offset, default_joint_pos)
-}}
 """
 
 
@@ -119,15 +93,17 @@ def read(source: Path, configs: Sequence[Path], robot: RobotConfig) -> Draft:
     """Understand a policy of this dialect. Raises PolicyError."""
     if robot.name not in MOTORS:
         raise PolicyError(f"{source}: got robot '{robot.name}', expected one of {', '.join(MOTORS)}: unitree_rl_gym")
-    file = _network_file(source)
+    file = network_file(source, "unitree_rl_gym")
     config = _read_configs(configs or sorted(file.parent.glob("*.yaml")), file.parent)
-    network = rebuild_lstm(file, config.num_obs) if file.suffix == ".pt" else _read_onnx(file)
+    network = rebuild_lstm(file, config.num_obs) if file.suffix == ".pt" else _read_recurrent(file)
     hidden = network.graph.output[1].type.tensor_type.shape.dim[-1].dim_value
-    n, steps = config.num_actions, round(GAIT_PERIOD / config.control_dt)
-    text = GRAPH.format(n=n, size=config.num_obs, hidden=hidden)
+    steps = round(GAIT_PERIOD / config.control_dt)
+    fields = _fields(config, robot, file, hidden)
     model = splice(
-        text,
+        BODY,
+        fields,
         {
+            **GRAVITY_CONSTANTS,
             "default_joint_pos": config.default_angles,
             "gyro_scale": config.ang_vel_scale,
             "command_scale": config.cmd_scale,
@@ -136,22 +112,16 @@ def read(source: Path, configs: Sequence[Path], robot: RobotConfig) -> Draft:
             "action_scale": config.action_scale,
             "phase_per_step": 2 * np.pi / steps,
             "steps_per_gait": steps,
-            "one": 1.0,
-            "two": 2.0,
-            "minus_two": -2.0,
         },
         {"layers": [0]},
         network,
     )
-    return Draft(model, _fields(config, robot, file, hidden), lambda: deploy_script(config, network, hidden))
+    return Draft(model, fields, lambda: deploy_script(config, network, hidden))
 
 
 def deploy_script(config: Config, network: ModelProto, hidden: int) -> Step:
     """What deploy_mujoco.py computes from the same signals, in float64, around the network as it was shipped."""
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(network.SerializeToString(), providers=["CPUExecutionProvider"])
-    names = [v.name for v in session.get_inputs()]
+    shipped = run_shipped(network)
     state = [np.zeros((1, 1, hidden), np.float32)] * 2
     action = np.zeros(config.num_actions)
     default = np.array(config.default_angles)
@@ -159,13 +129,11 @@ def deploy_script(config: Config, network: ModelProto, hidden: int) -> Step:
 
     def step(inputs: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         nonlocal state, action, tick
-        w, x, y, z = np.asarray(inputs["orientation_base_in_world"], float)
-        down_in_base = -np.array([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z])
         phase = tick * config.control_dt % GAIT_PERIOD / GAIT_PERIOD
         observation = np.concatenate(
             [
                 inputs["angular_velocity_base_in_base"] * config.ang_vel_scale,
-                down_in_base,
+                gravity_in_base(inputs["orientation_base_in_world"]),
                 inputs["command_velocity"] * np.array(config.cmd_scale),
                 (inputs["joint_pos"] - default) * config.dof_pos_scale,
                 inputs["joint_vel"] * config.dof_vel_scale,
@@ -173,8 +141,8 @@ def deploy_script(config: Config, network: ModelProto, hidden: int) -> Step:
                 [np.sin(2 * np.pi * phase), np.cos(2 * np.pi * phase)],
             ]
         ).astype(np.float32)
-        answer, *state = session.run(None, dict(zip(names, [observation[None], *state], strict=True)))
-        action, tick = np.asarray(answer)[0], tick + 1
+        answer, *state = shipped(observation[None], *state)
+        action, tick = answer[0], tick + 1
         return {
             "observation": observation,
             "action": action,
@@ -184,19 +152,6 @@ def deploy_script(config: Config, network: ModelProto, hidden: int) -> Step:
     return step
 
 
-def _network_file(source: Path) -> Path:
-    """The network itself; in a folder, ONNX before TorchScript, since it cannot carry code and needs no torch."""
-    if source.is_file():
-        return source
-    for suffix in (".onnx", ".pt"):
-        files = sorted(source.glob(f"*{suffix}"))
-        if len(files) > 1:
-            raise PolicyError(f"{source}: got networks {[f.name for f in files]}, expected one; name the file instead")
-        if files:
-            return files[0]
-    raise PolicyError(f"{source}: got no .onnx or .pt file, expected the network of unitree_rl_gym")
-
-
 def _read_configs(files: Sequence[Path], folder: Path) -> Config:
     """The YAML files laid over each other; they may repeat a value, not contradict it."""
     if not files:
@@ -204,13 +159,7 @@ def _read_configs(files: Sequence[Path], folder: Path) -> Config:
     document: dict[str, Any] = {}
     origin: dict[str, Path] = {}
     for file in files:
-        try:
-            content = yaml.safe_load(file.read_text())
-        except (OSError, yaml.YAMLError) as error:
-            raise PolicyError(f"{file}: got {' '.join(str(error).split())[:200]}, expected a YAML file") from None
-        if not isinstance(content, dict):
-            raise PolicyError(f"{file}: got no keys, expected a configuration of unitree_rl_gym")
-        for key, value in content.items():
+        for key, value in read_yaml(file, "unitree_rl_gym").items():
             if key in Config.model_fields and document.get(key, value) != value:
                 raise PolicyError(f"{file}: {key}: got {value}, expected {document[key]} as in {origin[key]}; pass one")
             document[key], origin[key] = value, file
@@ -256,52 +205,32 @@ def _fields(config: Config, robot: RobotConfig, file: Path, hidden: int) -> dict
         plan["kp"] = (
             max(plan["kp"], float(robot.kp_max[i])) if "waist" in joint else WRIST_KP if "wrist" in joint else ARM_KP
         )
-    carry = {"carry_action": n, "carry_hidden": hidden, "carry_cell": hidden, "carry_step": 1}
-    return {
-        "name": "unitree_rl_gym_walk",
-        "robot": robot.name,
-        "period": config.control_dt,
-        "joint_names": joints,
-        "target_joint_names": joints,
-        "default_joint_pos": config.default_angles,
-        "kp": config.kps,
-        "kd": config.kds,
-        "hold": hold,
-        "action_scale": [config.action_scale] * n,
-        "inputs": {
-            "joint_pos": [n],
-            "joint_vel": [n],
-            "orientation_base_in_world": [4],
-            "angular_velocity_base_in_base": [3],
-            "command_velocity": [3],
-            **{name: [size] for name, size in carry.items()},
+    return walk_fields(
+        "unitreerobotics/unitree_rl_gym",
+        "BSD-3-Clause",
+        file,
+        robot,
+        joints=joints,
+        default=config.default_angles,
+        kp=config.kps,
+        kd=config.kds,
+        hold=hold,
+        action_scale=config.action_scale,
+        observation=config.num_obs,
+        carry={
+            "carry_action": [0.0] * n,
+            "carry_hidden": [0.0] * hidden,
+            "carry_cell": [0.0] * hidden,
+            "carry_step": [0.0],
         },
-        "outputs": {
-            "joint_pos_target": [n],
-            "observation": [config.num_obs],
-            "action": [n],
-            **{f"{name}_next": [size] for name, size in carry.items()},
-        },
-        "carry": {name: {"shape": [size]} for name, size in carry.items()},
-        "skills": [{"label": "walk", "description": "walks at the commanded velocity; steps in place at zero"}],
-        "default_skill": "walk",
-        "command_velocity_min": tuple(-v for v in config.max_cmd),
-        "command_velocity_max": config.max_cmd,
-        "provenance": {
-            "source": f"unitreerobotics/unitree_rl_gym: {file.name}, sha256 {hashlib.sha256(file.read_bytes()).hexdigest()}",
-            "licence": "BSD-3-Clause",
-        },
-    }
+        command_max=config.max_cmd,
+        period=config.control_dt,
+        at_zero="steps in place",
+    )
 
 
-def _read_onnx(file: Path) -> ModelProto:
-    import onnx
-
-    try:
-        network = onnx.load_from_string(file.read_bytes())
-    except Exception as error:  # protobuf raises more than one kind
-        raise PolicyError(f"{file}: got {type(error).__name__}, expected ONNX; the file is damaged") from None
-    refuse_strange(network, str(file))
+def _read_recurrent(file: Path) -> ModelProto:
+    network = read_onnx(file)
     shapes = [[d.dim_value for d in v.type.tensor_type.shape.dim] for v in network.graph.output]
     if len(shapes) != 3 or not all(shapes[1:]) or shapes[1] != shapes[2]:
         names = [v.name for v in network.graph.output]

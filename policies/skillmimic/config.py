@@ -50,10 +50,10 @@ class SkillMimic:
     terminations: tuple[str, ...] = ("fallen", "tilted", "ball_lost", "broken")
     # the learner
     horizon: int = 24  # ticks per iteration
-    learning_rate: float = 4e-4
+    learning_rate: float = 5e-4
     samples: float = 20e6
-    gamma: float = 0.98
-    std: float = 0.12  # of the actions at the start; 0.25 costs a fifth of the reward of standing still
+    gamma: float = 0.97
+    std: float = 0.15  # of the actions at the start; 0.25 costs a fifth of the reward of standing still
     ppo: dict[str, float | int | str | bool] = field(
         default_factory=lambda: {
             "num_learning_epochs": 4,
@@ -61,7 +61,7 @@ class SkillMimic:
             "clip_param": 0.2,
             "lam": 0.95,
             "value_loss_coef": 1.0,
-            "entropy_coef": 0.002,
+            "entropy_coef": 0.0,
             "max_grad_norm": 1.0,
             "schedule": "fixed",
             "use_clipped_value_loss": False,
@@ -69,14 +69,21 @@ class SkillMimic:
     )
     # checkpoints and evaluation, in iterations
     save_every: int = 100
-    evaluate_every: int = 60
+    evaluate_every: int = 80
     evaluate_envs: int = 32
     evaluate_seconds: float = 6.0
 
 
 BASE = "policies/g1/basics.pt"
+BALL = {
+    **{
+        skill: [f"{skill}_{k:02d}" for k in range(1, 1 + n)]
+        for skill, n in (("hold", 7), ("carry", 4), ("pass", 3), ("catch", 7))
+    },
+    "dribble_in_place": ["dribble_in_place_01"],
+}
 TASKS: dict[str, SkillMimic] = {
-    "g1-ball": SkillMimic(base=BASE, clips=(), skills=("hold", "carry", "pass", "shot", "catch"), walks=("carry",), frames=100),
-    "g1-dribble": SkillMimic(base=BASE, clips=("dribble_in_place_01",), skills=("dribble_in_place",), frames=100),
+    "g1-ball": SkillMimic(base=BASE, skills=tuple(BALL), clips=tuple(clip for clips in BALL.values() for clip in clips),
+                          walks=("carry",), frames=150),
     "g1-pickup": SkillMimic(clips=(), skills=("pickup",), balance_gain=0.0, balance_damping=0.0, samples=100e6),
 }  # fmt: skip

@@ -32,6 +32,8 @@ def add_ball(timestep: float, palms: tuple[str, ...], radius: float = ball.RADIU
     """A ``prepare`` for any world of ``timestep`` s: the ball, and pads between it and the geoms ``palms``."""
 
     def prepare(spec: mujoco.MjSpec) -> None:
+        # With the pyramid that is MuJoCo's default a held ball creeps out of the hands within four seconds.
+        spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         ball.ball(timestep, radius=radius)(spec)
         for palm in palms:
             pair = spec.add_pair(name=f"pad/{palm}", geomname1=ball.NAME, geomname2=palm)

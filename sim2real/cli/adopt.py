@@ -19,7 +19,7 @@ class Args:
     """
 
     source: tyro.conf.Positional[Path]  # folder, or network file, of the foreign policy
-    dialect: str  # the other stack: unitree_rl_gym
+    dialect: str  # the other stack: booster_gym, holosoma, playground or unitree_rl_gym
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]  # policy file to write (.onnx)
     robot: str = "g1"  # name of a robot, or its YAML
     config: tuple[Path, ...] = ()  # configuration files of the other stack; none: those beside the network

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scripted_can import ScriptedMotors, leg
 
-from drivers.bus import BusError, MotorCommand
-from drivers.can_bus import ANSWER_TIME, QUEUE_FULL_TIME, TRIES, CanBus
+from drivers.bus import BusError, MotorCommand, MotorSpec, MotorState
+from drivers.can_bus import ANSWER_TIME, QUEUE_FULL_TIME, TRIES, CanBus, CanBuses, joined
 from drivers.codecs import damiao
 from drivers.codecs.damiao import Kind, Operation
 from drivers.open import open_bus
@@ -409,3 +409,99 @@ def test_two_motors_of_different_models_are_scaled_each_by_its_own():
     wire.torque[:] = [150.0, 30.0]
     bus.poll()
     np.testing.assert_allclose(bus.read(1.0).torque, [150, 30], atol=0.1)
+
+
+# Several buses in one call
+
+
+def pair() -> tuple[list[CanBus], list[ScriptedMotors], FakeClock]:
+    """Two connected buses with the same identifiers on both."""
+    (one, left, clock), (two, right, _) = made(3), made(2, name="arm")
+    left.position[:], right.position[:] = [0.1, 0.2, 0.3], [0.4, 0.5]
+    return [one, two], [left, right], clock
+
+
+def whole(buses: list[CanBus]) -> CanBuses:
+    ((all_of_them, motors),) = joined(buses)
+    assert isinstance(all_of_them, CanBuses) and motors == 5
+    return all_of_them
+
+
+def test_buses_in_one_call_send_and_hear_what_each_would_alone():
+    rng = np.random.default_rng(0)
+    asked = command(5, position=rng.normal(size=5), kp=np.full(5, 20.0), kd=np.ones(5), torque=rng.normal(size=5))
+    alone, wires, clock = pair()
+    for bus, rows in zip(alone, (slice(0, 3), slice(3, 5)), strict=True):
+        bus.write(MotorCommand(*(getattr(asked, name)[rows] for name in MotorCommand.__slots__)))
+    together, others, _ = pair()
+    buses = whole(together)
+    buses.write(asked)
+    for wire, other in zip(wires, others, strict=True):
+        assert [f.tobytes() for f in wire.sent] == [f.tobytes() for f in other.sent]
+    state = buses.read(clock.now())
+    for name in MotorState.__slots__:
+        expected = np.concatenate([getattr(bus.read(clock.now()), name) for bus in alone])
+        np.testing.assert_array_equal(getattr(state, name), expected)
+        np.testing.assert_array_equal(np.concatenate([getattr(bus.read(0.0), name) for bus in together]), expected)
+    assert [bus.counters for bus in together] == [bus.counters for bus in alone]
+
+
+@pytest.mark.parametrize("spoil", ["lost", "stranger", "error frame"])
+def test_buses_in_one_call_take_a_tick_that_is_not_whole_apart(spoil):
+    together, (left, right), clock = pair()
+    buses = whole(together)
+    buses.write(command(5))
+    rejected = [bus.counters.rejected for bus in together]
+    if spoil == "lost":
+        right._waiting.pop(0)
+    else:
+        frame = right._waiting[0].copy()
+        frame["id"] = ERROR if spoil == "error frame" else 0x123
+        right._waiting.insert(0, frame)
+    clock.time += 1.0
+    state = buses.read(clock.now())
+    fresh = state.time == clock.now()
+    assert fresh.tolist() == [True, True, True, spoil != "lost", True]
+    heard = [0.1, 0.2, 0.3, 0.0 if spoil == "lost" else 0.4, 0.5]  # 0: while connecting
+    np.testing.assert_allclose(state.position, heard, atol=1e-3)
+    assert together[1].counters.rejected - rejected[1] == (spoil == "stranger")
+    assert together[1].counters.extra["bus_errors"] == (spoil == "error frame")
+    assert together[0].counters.rejected == rejected[0] and together[0].counters.extra["bus_errors"] == 0
+
+
+@pytest.mark.parametrize("dead", [0, 1])
+def test_buses_in_one_call_drive_and_hear_the_others_of_a_dead_one(dead):
+    together, wires, clock = pair()
+    buses = whole(together)
+
+    def gone(*frames: np.ndarray) -> np.ndarray:
+        raise WireError("no such device")
+
+    wires[dead].refuse = gone
+    with pytest.raises(BusError, match=together[dead].spec.name):
+        buses.write(command(5))
+    assert len(wires[1 - dead].sent) == 1
+    wires[dead].recv = gone  # type: ignore[method-assign]
+    clock.time += 1.0
+    with pytest.raises(BusError, match=together[dead].spec.name):
+        buses.read(clock.now())
+    assert [(bus._state.time == clock.now()).all() for bus in together] == [dead == 1, dead == 0]
+
+
+def test_buses_in_one_call_refuse_what_each_would():
+    together, wires, _ = pair()
+    buses = whole(together)
+    with pytest.raises(ValueError, match="finite"):
+        buses.write(command(5, position=np.array([0, 0, 0, 0, np.nan])))
+    assert not any(wire.sent for wire in wires)
+    strangers = whole([made(3, connect=False)[0], made(2, connect=False)[0]])
+    with pytest.raises(BusError, match="not connected"):
+        strangers.write(command(5, kp=np.ones(5)))
+    strangers.write(command(5, kd=np.ones(5)))  # damping is what may always be sent
+
+
+def test_only_neighbours_of_one_plain_protocol_are_joined():
+    one, _, _ = made(3, connect=False)
+    other = open_bus(replace(leg(2), protocol="mini_cheetah", watchdog=0.0, name="arm",
+                             motors=tuple(MotorSpec(f"j{i}", "mini-cheetah", i) for i in (1, 2))), ScriptedMotors(leg(2)))  # fmt: skip
+    assert joined([one, other, other]) == [(one, 3), (other, 2), (other, 2)]

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import subprocess
+import sys
 import time
 
 import numpy as np
 import pytest
 import tiny_policy
+from source import ROOT
 from tiny_policy import TEXT
 
 from sim2real.policy import Policy, PolicyError, load_policy, mismatches, read_contract
@@ -115,3 +119,16 @@ def test_step_costs_little_more_than_onnxruntime(file, robot):
         t2 = time.perf_counter()
         best = {"step": min(best["step"], t1 - t0), "run": min(best["run"], t2 - t1)}
     assert best["step"] < 2.0 * best["run"]
+
+
+def test_onnxruntime_starts_no_thread_beside_the_policy(tmp_path, robot):
+    """Neither for its work nor to talk to its maker; it would, but not where it believes to be tested."""
+    path = tiny_policy.write(tmp_path / "tiny.onnx", tiny_policy.model(robot), tiny_policy.document(robot))
+    script = (
+        "import os, sys; from sim2real.policy import load_policy; load_policy(sys.argv[1], trial=0)\n"
+        "print(len(os.listdir('/proc/self/task')))"
+    )
+    env = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "HOME": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", script, path], env=env, capture_output=True, text=True, check=True)
+    assert int(done.stdout) == 1
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["tiny.onnx"]

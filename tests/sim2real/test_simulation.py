@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -72,28 +74,48 @@ def test_nothing_but_questions_is_sent_before_arming(robot, tiny):
     assert len(torque) > 0.4 * robot.wiring().rate and max(torque) < 1e-9 and not any(enabled)
 
 
-def walk(shared, tmp_path, **scene):
+class Walk(NamedTuple):
+    """A foreign policy in ``shared/policies``, and where its velocity in its maker's own simulation is recorded."""
+
+    robot: str
+    dialect: str
+    source: str
+    result: str
+
+
+WALKS = {
+    "unitree_rl_gym": Walk("g1", "unitree_rl_gym", "unitree_rl_gym_g1", "unitree_rl_gym_g1/result.json"),
+    "holosoma ppo": Walk("t1", "holosoma", "holosoma_t1/ppo_t1_29dof.onnx", "holosoma_t1/result_ppo.json"),
+    "holosoma fastsac": Walk("t1", "holosoma", "holosoma_t1/fastsac_t1_29dof.onnx", "holosoma_t1/result_fastsac.json"),
+    "booster_gym": Walk("t1", "booster_gym", "booster_gym_t1", "booster_gym_t1/result.json"),
+    "playground": Walk("t1", "playground", "playground_t1", "playground_t1/result.json"),
+}
+
+
+def walk(name, shared, tmp_path, **scene):
     from policies.adopt import adopt
 
-    robot = load_robot("g1")
+    robot = load_robot(WALKS[name].robot)
     path = tmp_path / "walk.onnx"
-    adopt(shared / "policies" / "unitree_rl_gym_g1", "unitree_rl_gym", robot, path)
+    adopt(shared / "policies" / WALKS[name].source, WALKS[name].dialect, robot, path)
     policy = load_policy(path, robot, trial=0)
     operator = ScriptOperator([Step("walk", 20.0, (0.5, 0.0, 0.0))])
     return Simulation(robot, [policy], operator, Scene(**scene)).run()
 
 
 @pytest.mark.slow
-def test_the_adopted_walk_keeps_its_recorded_velocity_through_the_bytes(shared, tmp_path):
-    """One seed here; ``make bench`` runs five. 0.476 m/s is recorded in shared/policies/README.md."""
-    summary = walk(shared, tmp_path, seed=0)
+@pytest.mark.parametrize("name", WALKS)
+def test_an_adopted_walk_keeps_its_recorded_velocity_through_the_bytes(name, shared, tmp_path):
+    """One seed here; ``make bench`` runs five."""
+    summary = walk(name, shared, tmp_path, seed=0)
     assert not summary.fell and not summary.faults
-    assert summary.mean_velocity[0] == pytest.approx(0.476, rel=0.05)
+    recorded = json.loads((shared / "policies" / WALKS[name].result).read_text())["runs"]["forward_0.5"]
+    assert summary.mean_velocity[0] == pytest.approx(recorded["mean_vx_body_after2s"], rel=0.05)
 
 
 @pytest.mark.slow
 def test_the_adopted_walk_survives_a_tenth_of_all_frames_dropped(shared, tmp_path):
-    summary = walk(shared, tmp_path, seed=0, faults=["drop:0.1"])
+    summary = walk("unitree_rl_gym", shared, tmp_path, seed=0, faults=["drop:0.1"])
     assert not summary.fell and not summary.faults
 
 

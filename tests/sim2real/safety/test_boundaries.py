@@ -182,8 +182,9 @@ class ClampCases:
         return field, asked, sign * limit, b.tick(command={field: {j: asked}, "kd": {j: 0.0}, "kp": {j: 0.0}})
 
     def slew(self, b: Bench, j: int, outside: bool, sign: int):
-        dt = 2 * DT
-        limit = b.pose[j] + sign * (b.robot.velocity_max[j] * b.robot.safety.target_velocity_ratio * dt)
+        ratio = b.robot.safety.target_velocity_ratio
+        dt = 2 * DT / ratio  # short enough not to reach the end of any joint's range
+        limit = b.pose[j] + sign * (b.robot.velocity_max[j] * ratio * dt)
         asked = np.nextafter(limit, sign * np.inf) if outside else limit
         return "joint_pos", asked, limit, b.tick(dt, command={"joint_pos": {j: asked}, "kp": {j: 1.0}})
 

@@ -80,7 +80,7 @@ def test_arm_starts_from_where_the_robot_stands(bench):
     target = bench.pose + np.sign(bench.pose - 1) * 1.0
     command = bench.tick(command={"joint_pos": target, "kp": np.full(bench.n, 1.0)})
     moved = np.abs(command.joint_pos - bench.pose)
-    assert (moved <= bench.robot.velocity_max * DT * (1 + 1e-9)).all() and moved.all()
+    assert (moved <= bench.limits.target_velocity * DT * (1 + 1e-9)).all() and moved.all()
 
 
 def test_arm_works_on_the_very_first_state(bench):
