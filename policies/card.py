@@ -194,12 +194,17 @@ Share of {SECONDS:g} s episodes without a fall, with 95 % confidence, on robots 
 
 
 def eval_command(file: Path, episodes: int, deployed: int, report: Path | None, card_file: Path | None) -> bool:
-    """``sim2real eval``: measure, print, write. Returns whether undisturbed survival is at least 95 % everywhere."""
+    """``sim2real eval``: measure, print, write. Returns whether undisturbed survival is at least 95 % everywhere; of skills
+    with an object, see policies/skillmimic/card.py."""
     from rich.console import Console
     from rich.table import Table
 
     console = Console()
     contract = load_policy(file).contract
+    if contract.object is not None:
+        from policies.skillmimic.card import eval_command as eval_ball_skills
+
+        return eval_ball_skills(file, episodes, deployed, report, card_file)
     e = evaluate(file, Basics(), episodes, deployed, tell=lambda text: console.print(f"[dim]{text} ...[/]"))
     table = Table(title=f"{contract.name}: survival of {SECONDS:g} s (95 % confidence)", box=None)
     for column in ("skill", "undisturbed", f"pushed to {PUSH:g} m/s", "joint error"):

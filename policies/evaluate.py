@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -64,16 +64,22 @@ class FileActor:
     """A policy file in every robot of an environment, fed what a robot would measure, each with a memory of its own.
 
     The environment turns actions into targets; Sim2realError if the file's own targets are others, because it was made
-    with other settings than ``policies.basics`` holds now.
+    with other settings than ``settings`` holds now.
     """
+
+    settings = "policies/basics.py"
 
     def __init__(self, path: Path, robots: int) -> None:
         self.path = path
         first, data = load_policy(path, trial=0), path.read_bytes()  # proved once, run in every robot
         self.policies: list[Policy] = [first, *(Policy(data, first.contract, path) for _ in range(robots - 1))]
 
-    def __call__(self, env: Env) -> Tensor:
-        signals = {name: signal.numpy() for name, signal in env.signals.items()}
+    def signals(self, env: Any) -> dict[str, Tensor]:
+        """What every robot measures: (envs, size) by name."""
+        return env.signals
+
+    def __call__(self, env: Any) -> Tensor:
+        signals = {name: signal.numpy() for name, signal in self.signals(env).items()}
         born = env.episode_length_buf.numpy() == 0
         actions = np.zeros((env.num_envs, env.num_actions), np.float32)
         targets = np.zeros((env.num_envs, env.model.nu), np.float32)
@@ -86,7 +92,7 @@ class FileActor:
         error = float((env.graph.target(env.measured, result) - torch.from_numpy(targets)).abs().max())
         if not error < 1e-3:
             raise Sim2realError(
-                f"{self.path}: its targets are up to {error:.2g} rad off those of policies/basics.py for the same actions,"
+                f"{self.path}: its targets are up to {error:.2g} rad off those of {self.settings} for the same actions,"
                 " expected the same; it was made with other settings: export it again (sim2real export)"
             )
         return result

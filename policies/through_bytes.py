@@ -12,7 +12,7 @@ from policies.basics import MOTIONS, Basics
 from policies.randomisation import TABLE
 from sim2real.config import load_robot
 from sim2real.operators.script import ScriptOperator, Step
-from sim2real.policy import load_policy
+from sim2real.policy import load_policy, read_contract
 from sim2real.simulation import Scene, Simulation
 from sim2real.summary import Summary
 
@@ -25,22 +25,34 @@ def deploy_episode(
     ``push``: m/s, the largest of random pushes, as in training but without their spin; 0: none.
     """
     rng = np.random.default_rng(seed)
-    robot = load_robot(config.robot)
     duration = sum(seconds for _, seconds in steps)
     pushes = list(random_pushes(rng, config, duration, push)) if push else []
-    simulation = Simulation(
-        robot,
-        [load_policy(path, robot, trial=0)],
-        ScriptOperator([Step(label, seconds, command(label, rng, config)) for label, seconds in steps]),
-        Scene(seed=seed, prepare=random_body(rng), pushes=pushes),
-    )
-    return simulation.run()
+    return deployed(
+        path, steps, Scene(seed=seed, prepare=random_body(rng), pushes=pushes), commands(steps, rng, config)
+    ).run()
 
 
-def command(label: str, rng: np.random.Generator, config: Basics) -> tuple[float, float, float]:
-    """A velocity command as in training, for a skill that obeys one."""
-    forward, left, turn = rng.uniform(config.command_low, config.command_high) * MOTIONS[label].walks
-    return float(forward), float(left), float(turn)
+def deployed(
+    path: Path,
+    steps: list[tuple[str, float]],
+    scene: Scene,
+    velocities: list[tuple[float, float, float]] | None = None,
+    each_tick: Callable[[Simulation], None] | None = None,
+) -> Simulation:
+    """A lockstep run of a policy file, to be run: ``steps`` (label, seconds) on the robot that it was made for, with a
+    velocity command each."""
+    robot = load_robot(read_contract(path).robot)
+    given = velocities or [(0.0, 0.0, 0.0)] * len(steps)
+    operator = ScriptOperator([Step(label, seconds, v) for (label, seconds), v in zip(steps, given, strict=True)])
+    return Simulation(robot, [load_policy(path, robot, trial=0)], operator, scene, each_tick=each_tick)
+
+
+def commands(
+    steps: list[tuple[str, float]], rng: np.random.Generator, config: Basics
+) -> list[tuple[float, float, float]]:
+    """A velocity command for every step, as in training; none for skills that obey none."""
+    drawn = [rng.uniform(config.command_low, config.command_high) * MOTIONS[label].walks for label, _ in steps]
+    return [(float(forward), float(left), float(turn)) for forward, left, turn in drawn]
 
 
 def stayed_up(summary: Summary, seconds: float) -> bool:

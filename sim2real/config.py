@@ -78,6 +78,7 @@ class SafetyConfig(Strict):
     enable_time: Positive = 0.06  # s, while armed, without a motor saying that it is enabled
     command_age_hold: Positive = 0.04  # s without a fresh command: hold
     command_age: Positive = 0.06  # s without a fresh command: damp
+    object_age: Positive = 0.3  # s without sight of the object that the skill handles: hold, and damp if it lasts
     hold_time: Positive = 0.04  # s: longest hold of any cause, then damp
     arm_tilt: Positive = 0.35  # rad: refuse to arm beyond
     arm_velocity: Positive = 0.5  # rad/s: refuse to arm while any joint moves faster
@@ -168,6 +169,8 @@ class RobotConfig(Strict):
     safety: SafetyConfig = SafetyConfig()
     home: PoseConfig  # where a soft start goes when the policy says nothing else
     policies: dict[str, PolicyEntry] = {}
+    default_skills: str = ""
+    skills: dict[str, Annotated[list[str], Field(min_length=1)]] = {}  # sets of policies that are loaded together
     default_wiring: str
     wirings: dict[str, Wiring]
 
@@ -180,6 +183,11 @@ class RobotConfig(Strict):
             raise ValueError(f"joints: got {repeated} more than once, expected every name once")
         if self.default_wiring not in self.wirings:
             raise ValueError(f"default_wiring: got '{self.default_wiring}', expected one of {sorted(self.wirings)}")
+        if self.skills and self.default_skills not in self.skills:
+            raise ValueError(f"default_skills: got '{self.default_skills}', expected one of {sorted(self.skills)}")
+        for name in (n for names in self.skills.values() for n in names):
+            if name not in self.policies:
+                raise ValueError(f"skills: got policy '{name}', expected one of {sorted(self.policies)}")
         for table in ("joints", "kp", "kd"):
             for name in getattr(self.home, table):
                 if name not in names:
@@ -277,6 +285,22 @@ class RobotConfig(Strict):
                 f"{self.name}: no wiring '{name}'{did_you_mean(name, self.wirings)}; it has {', '.join(self.wirings)}"
             )
         return self.wirings[name]
+
+    def skill_set(self, name: str = "") -> list[PolicyEntry]:
+        """The policies of the set ``name``, or of the default one; a robot without sets has all of its policies as one.
+        Raises ConfigError where there is none."""
+        name = name or self.default_skills
+        if not name and not self.skills and self.policies:
+            return list(self.policies.values())
+        if name not in self.skills:
+            which = f"skills '{name}'" if name else "skills"
+            known = f"; it has {', '.join(self.skills)}" if self.skills else ""
+            raise ConfigError(
+                f"{self.name}: its YAML names no {which}{did_you_mean(name, self.skills)}{known};"
+                " give a policy with --policy FILE.onnx, or name a set under 'skills:'\n"
+                f"  a first policy that holds the home posture: sim2real posture --robot {self.path} -o FILE.onnx"
+            )
+        return [self.policies[policy] for policy in self.skills[name]]
 
 
 def robot_names() -> list[str]:

@@ -45,6 +45,7 @@ OUTPUTS: dict[str, Signal] = {
     "skill_value": Signal("skills", "1", "inspect/value", "per label, how well the policy expects to do from here"),
 }
 CARRY = "carry_"  # carry_x is fed back from carry_x_next
+OBJECT = ("object_position_in_base", "object_velocity_in_base")  # inputs that somebody has to see
 
 # Policy files come from elsewhere: what they say ends up in terminals, file names and web pages.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")]
@@ -83,6 +84,27 @@ class Hold(Strict):
     kd: Unsigned
 
 
+class Object(Strict):
+    """The object that a policy was trained to handle: what a tracker expects, and a simulation builds."""
+
+    kind: Literal["ball"] = "ball"
+    radius: Positive  # m
+    mass: Positive  # kg
+    restitution: Annotated[float, Field(gt=0, lt=1)]
+
+
+class ObjectStart(Strict):
+    """How a skill finds its object when it begins: in its hands, at rest on the floor, or flying.
+
+    What is ``held`` is told in the base. Else the frame is the heading's: the origin on the floor below the base, x where
+    the robot faces, z up.
+    """
+
+    how: Literal["held", "placed", "thrown"]
+    position: tuple[float, float, float]  # m
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m/s
+
+
 class Skill(Strict):
     """One label a policy can perform."""
 
@@ -91,6 +113,7 @@ class Skill(Strict):
     next: list[Name] | None = None  # labels it may be followed by; None: any
     dwell: Unsigned = 0.3  # s, shortest stay
     value_min: float | None = None  # refuse to switch to it while skill_value is below
+    object: ObjectStart | None = None  # None: wherever it is
 
 
 class Provenance(Strict):
@@ -115,6 +138,9 @@ class Contract(Strict):
     joint_names: Annotated[list[Name], Field(min_length=1)]  # joints it observes
     target_joint_names: Annotated[list[Name], Field(min_length=1)]  # joints it drives
     default_joint_pos: list[float]  # rad, of joint_names: where it expects to start
+    approach_joint_pos: list[
+        float
+    ] = []  # rad: where the soft start goes before, such as hands around an object; or none
     kp: list[Unsigned]  # N m/rad, of target_joint_names, full precision
     kd: list[Unsigned]  # N m s/rad
     hold: dict[Name, Hold] = {}  # joints of the robot that it does not drive
@@ -122,6 +148,7 @@ class Contract(Strict):
     inputs: dict[Name, list[int]]  # name -> shape without the batch axis
     outputs: dict[Name, list[int]]
     carry: dict[Name, Carry] = {}
+    object: Object | None = None  # None: it handles none
     skills: Annotated[list[Skill], Field(min_length=1)]
     default_skill: Name
     command_velocity_min: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -140,10 +167,16 @@ class Contract(Strict):
     def skill(self, label: str) -> Skill:
         return self.skills[self.skill_labels.index(label)]
 
+    @property
+    def sees_object(self) -> bool:
+        """Whether somebody has to tell it where its object is."""
+        return any(name in self.inputs for name in OBJECT)
+
     @model_validator(mode="after")
     def _consistent(self) -> Contract:
         sizes = {
             "default_joint_pos": self.joint_names,
+            **({"approach_joint_pos": self.joint_names} if self.approach_joint_pos else {}),
             "kp": self.target_joint_names,
             "kd": self.target_joint_names,
             **({"action_scale": self.target_joint_names} if self.action_scale else {}),
@@ -185,6 +218,8 @@ class Contract(Strict):
                 )
         if strangers := [n for n in self.inputs if n.startswith(CARRY) and n not in self.carry]:
             raise ValueError(f"carry: nothing says how {strangers} start")
+        if self.object is None and (needy := [n for n in OBJECT if n in self.inputs]):
+            raise ValueError(f"object: missing, expected what {' and '.join(needy)} are about: kind, radius, ...")
         if driven := [n for n in self.hold if n in self.target_joint_names]:
             raise ValueError(f"hold: {driven} are in target_joint_names too, expected joints that are not driven")
         if "skill_value" not in self.outputs and (gated := [s.label for s in self.skills if s.value_min is not None]):

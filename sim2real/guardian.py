@@ -26,7 +26,7 @@ from sim2real.run import Life, RunSpec, channel, keep_time, sink, tell
 from sim2real.safety import Limits, Safety
 from sim2real.types import JointCommand, Mode, Sim2realError
 
-TICK, PILOT = 0, 1  # topics of a record
+TICK, PILOT, OBJECT = 0, 1, 2  # topics of a record
 
 
 class Sink(Protocol):
@@ -152,6 +152,7 @@ class Guardian:
     def _request(self) -> JointCommand | None:
         if self.requests.read():
             self._wish.time = float(self.requests.record["command.time"][0])
+            self._wish.object_time = float(self.requests.record["command.object_time"][0])
         return self._wish if self._wish.time else None
 
     def _obey_operator(self, now: float) -> Calls:
@@ -239,9 +240,9 @@ class Guardian:
         r["fault"][0] = fault.rule.number if fault else 0
         r["fault_joint"][0] = fault.joint if fault else -1
         _copy(self._wish, self._requested)
-        r["request.time"][0] = self._wish.time
+        r["request.time"][0], r["request.object_time"][0] = self._wish.time, self._wish.object_time
         _copy(command, self._sent)
-        r["command.time"][0] = command.time
+        r["command.time"][0], r["command.object_time"][0] = command.time, command.object_time
         r["timing.safety"][0], r["timing.write"][0] = judged - start, written - judged
         c = self._counted
         c.T[:] = [

@@ -26,13 +26,14 @@ from sim2real.channel import run_directory
 from sim2real.clock import MonotonicClock, Schedule
 from sim2real.config import RobotConfig
 from sim2real.guardian import operator_layout
+from sim2real.object.packet import ADDRESS, listen
+from sim2real.object.scene import Handover, starts_of
 from sim2real.operators import Operator, store
-from sim2real.pilot import layout_of
-from sim2real.records import tick_layout
+from sim2real.pilot import topics
 from sim2real.robot import Robot, open_robot
 from sim2real.run import RunSpec, channel
 from sim2real.simulation import support
-from sim2real.skills import SkillPlayer, Stage
+from sim2real.skills import SkillPlayer, Stage, object_for
 from sim2real.summary import Measures, Summary
 from sim2real.types import JointCommand, Mode, Sim2realError
 
@@ -112,6 +113,7 @@ class Launch:
     recorder: Any = None  # a started sim2real.recorder.process.Recorder
     show: Callable[[Launch], None] = lambda launch: None
     hang: bool = False  # nobody sets the simulated robot down from its gantry
+    sightings: tuple[str, int] = ADDRESS  # of hardware: the UDP address at which the object's sightings are awaited
     messages: list[str] = field(default_factory=list)
     timeout: float = 10.0  # s to be armed and through the soft start, counted from the wish to arm
 
@@ -119,6 +121,13 @@ class Launch:
         self.wiring = self.wiring or self.config.default_wiring
         self.directory = run_directory()
         inherit = self.recorder.sink.fileno() if self.recorder else -1
+        contracts = [policy.contract for policy in self.player.policies]
+        thing = object_for(contracts)
+        self._sightings = None
+        if self.player.tracker is not None:
+            self._sightings = listen(("127.0.0.1", 0) if self.simulated else self.sightings)
+        self._starts = starts_of(contracts)
+        self.handover: Handover | None = None
         self.spec = RunSpec(
             robot=str(self.config.path.absolute()),
             wiring=self.wiring,
@@ -126,6 +135,9 @@ class Launch:
             policies={str(p.path.absolute()): p.sha256 for p in self.player.policies},
             tune=self.tune,
             recorder=inherit,
+            sightings=self._sightings.fileno() if self._sightings else -1,
+            camera=self._sightings.getsockname() if self._sightings and self.simulated else None,
+            object=thing,
             seed=self.seed,
             faults=list(self.faults),
             calibration=str(self.calibration.absolute()) if self.calibration else "",
@@ -133,10 +145,9 @@ class Launch:
         )
         wired = self.wired = self.spec.open()[1]
         self.spec.save(self.directory)
-        self.states = channel(
-            self.directory, "tick", tick_layout(self.config.joint_names, [b.name for b in wired.buses])
-        )
-        self.pilot_states = channel(self.directory, "pilot", layout_of(self.player))
+        layouts = topics(self.config, [b.name for b in wired.buses], self.player)
+        self.states = channel(self.directory, "tick", layouts["/tick"])
+        self.pilot_states = channel(self.directory, "pilot", layouts["/pilot"])
         self._wishes = channel(self.directory, "operator", operator_layout())
         self._wish = self._wishes.layout.new()
         self.measures = Measures(self.config, wired, self.player)
@@ -175,6 +186,8 @@ class Launch:
 
             self._child("world", "sim2real.world").ready(20.0)
             self.world = WorldRemote(self.directory / "world.sock")
+            if self.spec.object is not None:
+                self.handover = Handover(self.world, self._starts)
         self._robot().close()  # rehearses the last will: everything is imported, every wire is there
         guardian = self._child("guardian", "sim2real.guardian")
         pilot = self._child("pilot", "sim2real.pilot")
@@ -198,7 +211,10 @@ class Launch:
         return tuple(sorted(set.intersection(*named))) if named else ()
 
     def _child(self, name: str, module: str) -> Child:
-        child = self.children[name] = Child(module, self.directory, [] if name == "world" else self._inherit)
+        inherit = [] if name == "world" else list(self._inherit)
+        if name == "pilot" and self._sightings is not None:
+            inherit.append(self._sightings.fileno())
+        child = self.children[name] = Child(module, self.directory, inherit)
         return child
 
     def _operate(self) -> None:
@@ -226,6 +242,8 @@ class Launch:
             if self.world is not None:
                 if hanging:
                     hanging = support(self.world, self.stage, self._engage_left(now), self.since)
+                if self.handover is not None:
+                    self.handover.act(self.stage, self.skill, self._engage_left(now), self.since)
                 self.measures.observe(self.world, self.states.record, self.pilot_states.record, self.since)
             self.measures.tick(self.states.record)
             self._listen()
@@ -282,4 +300,6 @@ class Launch:
         if "world" in self.children:
             self.children["world"].end(3.0)
         self.operator.close()
+        if self._sightings is not None:
+            self._sightings.close()
         shutil.rmtree(self.directory, ignore_errors=True)

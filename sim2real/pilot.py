@@ -5,18 +5,38 @@ It owns nothing that could hurt: if it crashes, hangs or is killed, its last com
 
 from __future__ import annotations
 
+import math
+import socket
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 from sim2real.channel import Channel
 from sim2real.clock import MonotonicClock, SimClock
-from sim2real.guardian import PILOT, Sink, operator_layout, request_layout
-from sim2real.records import VECTOR, Layout, command_view, pilot_layout, state_view, tick_layout
+from sim2real.config import RobotConfig
+from sim2real.guardian import OBJECT, PILOT, Sink, operator_layout, request_layout
+from sim2real.records import VECTOR, Layout, command_view, object_layout, pilot_layout, state_view, tick_layout
 from sim2real.run import Life, RunSpec, channel, keep_time, sink, tell
 from sim2real.skills import SkillPlayer
+from sim2real.tracker import ObjectSample
 from sim2real.types import Mode, OperatorInput
 
 PHASE = 0.0005  # s after the guardian's tick: it has read the buses by then
+
+
+class Sightings(Protocol):
+    """Where sightings of the object come from."""
+
+    def read(self, now: float) -> Sequence[ObjectSample]:
+        """What has arrived by ``now`` (s) since the last call. Never waits."""
+        ...
+
+
+def topics(config: RobotConfig, buses: Sequence[str], player: SkillPlayer) -> dict[str, Layout]:
+    """What is recorded of a run: topic -> layout, in the order of ``guardian.TICK, PILOT, OBJECT``."""
+    layouts = {"/tick": tick_layout(config.joint_names, buses), "/pilot": layout_of(player)}
+    return layouts | ({"/object": object_layout()} if player.tracker is not None else {})
 
 
 def layout_of(player: SkillPlayer) -> Layout:
@@ -49,7 +69,9 @@ class Pilot:
         requests: Channel,
         published: Channel,
         sink: Sink | None = None,
+        sightings: Sightings | None = None,
     ):
+        self.sightings = sightings
         self.player, self.clock = player, clock
         self.states, self.operator, self.requests, self.published, self.sink = (
             states,
@@ -64,6 +86,8 @@ class Pilot:
         self._request_view = command_view(self.request, "command")
         self._heard = False
         self._tick = 0
+        self._object = object_layout().new()
+        self._object["sighting.time"], self._object["sighting.position_in_base"] = -math.inf, math.nan
 
     def tick(self, scheduled: float, lateness: float = 0.0, late: int = 0) -> None:
         """One turn of the loop."""
@@ -73,6 +97,7 @@ class Pilot:
             self._heard = True
             self._state.time = float(self.states.record["state.time"][0])
             self._state.imu_age = float(self.states.record["state.imu_age"][0])
+        self._look(start)
         wish = self._wish()
         before = clock.now()
         mode = Mode(int(self.states.record["mode"][0])) if self._heard else Mode.OFF
@@ -82,6 +107,7 @@ class Pilot:
             getattr(self._request_view, name)[:] = getattr(command, name)
             r[f"command.{name}"][0] = getattr(command, name)
         self.request["command.time"] = r["command.time"] = command.time
+        self.request["command.object_time"] = r["command.object_time"] = command.object_time
         self.requests.write(self.request)
         r["time"], r["tick"], r["late"] = scheduled, self._tick, late
         r["stage"], r["policy"], r["skill"] = player.stage, player.policy_index, player.skill
@@ -97,7 +123,28 @@ class Pilot:
         self.published.write(r)
         if self.sink is not None:
             self.sink.write(PILOT, scheduled, r)
+            self._record_object(scheduled)
         self._tick += 1
+
+    def _look(self, now: float) -> None:
+        """Hand the tracker what has arrived."""
+        if self.sightings is None or self.player.tracker is None:
+            return
+        for sample in self.sightings.read(now):
+            self.player.tracker.measure(sample)
+            o = self._object
+            o["sighting.time"], o["sighting.position_in_base"][0] = sample.time, sample.position_object_in_base
+            o["sightings"] += 1
+
+    def _record_object(self, scheduled: float) -> None:
+        tracker, o = self.player.tracker, self._object
+        if tracker is None or self.sink is None:
+            return
+        seen = tracker.current
+        o["time"], o["tick"], o["used"] = scheduled, self._tick, tracker.counters.used
+        o["position_in_base"][0], o["velocity_in_base"][0] = seen.position_in_base, seen.velocity_in_base
+        o["age"], o["flying"] = seen.age, seen.flying
+        self.sink.write(OBJECT, scheduled, o)
 
     def _wish(self) -> OperatorInput:
         self.operator.read()
@@ -110,6 +157,7 @@ class Pilot:
 
 def main(directory: Path) -> int:
     """The pilot process of the run in ``directory``."""
+    from sim2real.object.packet import UdpSightings
     from sim2real.policy import load_policy
 
     life = Life()
@@ -125,6 +173,7 @@ def main(directory: Path) -> int:
         channel(directory, "request", request_layout(joints)),
         channel(directory, "pilot", layout_of(player)),
         sink(spec),
+        UdpSightings(socket.socket(fileno=spec.sightings)) if spec.sightings >= 0 else None,
     )
     refused = 0
 
@@ -132,7 +181,7 @@ def main(directory: Path) -> int:
         nonlocal refused
         pilot.tick(scheduled, lateness, late)
         for refusal in player.refusals[refused:]:
-            tell(f"kept the current skill: {refusal.skill}: {refusal.reason}")
+            tell(f"refused '{refusal.skill}': {refusal.reason}")
         refused = len(player.refusals)
 
     keep_time(tick, player.period, spec, 70, life.goes_on, PHASE, cpu=0)

@@ -69,7 +69,11 @@ def state_fields(joints: Sequence[str]) -> list[Field]:
 def command_fields(prefix: str, joints: Sequence[str]) -> list[Field]:
     """The fields of a ``types.JointCommand``, under ``prefix``."""
     arrays = ("joint_pos", "joint_vel", "joint_torque", "kp", "kd")
-    return [(f"{prefix}.time", "f8", None), *((f"{prefix}.{name}", "f8", joints) for name in arrays)]
+    scalars = ("time", "object_time")
+    return [
+        *((f"{prefix}.{name}", "f8", None) for name in scalars),
+        *((f"{prefix}.{name}", "f8", joints) for name in arrays),
+    ]
 
 
 def tick_layout(joints: Sequence[str], buses: Sequence[str]) -> Layout:
@@ -127,6 +131,25 @@ def pilot_layout(joints: Sequence[str], inputs: Mapping[str, Sequence[str]], ski
     )
 
 
+def object_layout() -> Layout:
+    """What was seen of the object and what is believed of it, each policy tick. Axes of the base."""
+    return layout(
+        "Object",
+        [
+            ("time", "f8", None),
+            ("tick", "i8", None),
+            ("position_in_base", "f8", VECTOR),  # m, the estimate that policies are fed; NaN: never seen
+            ("velocity_in_base", "f8", VECTOR),  # m/s
+            ("age", "f8", None),  # s since the newest sighting behind it was taken; inf: never
+            ("flying", "f8", None),  # probability
+            ("sighting.time", "f8", None),  # s, exposure of the newest sighting that arrived
+            ("sighting.position_in_base", "f8", VECTOR),  # m, at that time
+            ("sightings", "i8", None),  # that arrived so far
+            ("used", "i8", None),  # of them; the rest was late, stale, early or strange
+        ],
+    )
+
+
 def state_view(record: np.ndarray) -> RobotState:
     """A RobotState whose arrays are views into ``record``; scalars are copies, which the caller writes back."""
     r = record[0]
@@ -151,4 +174,5 @@ def command_view(record: np.ndarray, prefix: str) -> JointCommand:
     return JointCommand(
         time=float(record[f"{prefix}.time"][0]),
         **{f: record[f"{prefix}.{f}"][0] for f in ("joint_pos", "joint_vel", "joint_torque", "kp", "kd")},
+        object_time=float(record[f"{prefix}.object_time"][0]),
     )

@@ -21,6 +21,7 @@ from sim2real.calibration import load_calibration
 from sim2real.channel import Channel
 from sim2real.clock import MonotonicClock, Schedule, tune
 from sim2real.config import RobotConfig, Strict, Wiring, load_robot
+from sim2real.contract import Object
 from sim2real.recorder.process import Sink
 from sim2real.records import Layout
 
@@ -34,6 +35,11 @@ class RunSpec(Strict):
     policies: dict[str, str]  # path -> sha256 of the file that was proved before the run
     tune: bool = True  # ask the kernel for punctuality
     recorder: int = -1  # file descriptor of the recorder's channel, inherited; -1: no record
+    sightings: int = (
+        -1
+    )  # file descriptor of the UDP socket on which the object's sightings come; -1: there is no object
+    camera: tuple[str, int] | None = None  # where the simulated camera sends its own
+    object: Object | None = None  # what the simulated world has besides the robot
     seed: int = 0
     faults: list[str] = []
     calibration: str = ""  # path of the file; "": signs and offsets are the wiring's own
@@ -57,7 +63,7 @@ def sink(spec: RunSpec) -> Sink | None:
     """The way to the recorder, if this run has one."""
     if spec.recorder < 0:
         return None
-    return Sink(socket.socket(fileno=spec.recorder), topics=2)
+    return Sink(socket.socket(fileno=spec.recorder), topics=2 if spec.sightings < 0 else 3)
 
 
 def channel(directory: Path, name: str, layout: Layout) -> Channel:

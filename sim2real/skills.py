@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from sim2real.config import RobotConfig
-from sim2real.contract import CARRY, INPUTS, Contract
+from sim2real.contract import CARRY, INPUTS, Contract, Object
 from sim2real.tracker import ObjectEstimate, ObjectTracker
 from sim2real.types import JointCommand, Mode, OperatorInput, RobotState, Sim2realError
 
@@ -49,7 +49,9 @@ class Refusal(NamedTuple):
 class SkillPlayer:
     """Runs the skills of one or more policies on one robot.
 
-    ``tracker``: who tells where the object is; whoever runs the player feeds it sightings.
+    ``tracker``: who tells where the object is, None: no policy asks; whoever runs the player feeds it sightings. While
+    the object is out of sight for longer than ``object_patience``, no skill that needs it is begun, and one that runs
+    gives way to a skill of another policy that needs none, if there is one.
 
     Labels of all policies share one namespace (``labels``). A wish for another label is granted if the contract allows
     the transition, the current skill has had its dwell time, and the policy expects to manage it (``value_min``);
@@ -57,9 +59,13 @@ class SkillPlayer:
     """
 
     gain_time = 0.6  # s for the gains to rise
-    move_time = 1.4  # s to move to the start posture after that
+    move_time = 1.4  # s to move to the start posture after that, or to the posture before it if the policy has one
+    close_time = 0.6  # s from there to the start posture
     blend_time = 0.3  # s from one policy's targets to another's
     operator_timeout = 0.5  # s: an operator older than this wants velocity zero
+    object_patience = (
+        0.2  # s; before the gate's own (SafetyConfig.object_age), so that there is something to fall back to
+    )
 
     def __init__(self, config: RobotConfig, policies: Sequence[Runnable], tracker: ObjectTracker | None = None):
         if not policies:
@@ -78,10 +84,11 @@ class SkillPlayer:
         if len(periods) > 1:
             raise Sim2realError(f"policies: got periods {sorted(periods)} s, expected one; export them at one rate")
         self.period = periods.pop()
-        self.tracker = tracker
-        self.plans = [_Plan(config, policy.contract, tracker) for policy in policies]
+        self.tracker = tracker or tracker_for([policy.contract for policy in policies])
+        seen = self.tracker.current if self.tracker is not None else ObjectEstimate()
+        self.plans = [_Plan(config, policy.contract, seen) for policy in policies]
         n = len(config.joint_names)
-        self.command = JointCommand(-np.inf, *(np.zeros(n) for _ in range(5)))
+        self.command = JointCommand(-np.inf, np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n))
         self.values = np.full(len(self.labels), np.nan)
         self.stage = Stage.STANDBY
         self.skill = self.labels.index(policies[0].contract.default_skill)
@@ -105,11 +112,17 @@ class SkillPlayer:
     @property
     def engage_time(self) -> float:
         """Length of the soft start, s."""
-        return self.gain_time + self.move_time
+        via = self.plans[self.policy_index].approach is not None
+        return self.gain_time + self.move_time + (self.close_time if via else 0.0)
 
     def engage_left(self, now: float) -> float:
         """Seconds until the soft start ends."""
         return self._engaged + self.engage_time - now
+
+    @property
+    def object_age(self) -> float:
+        """s since the object that the current skill needs was seen; inf: never, -inf: it needs none."""
+        return self._age(self.policy_index)
 
     def start_posture(self) -> np.ndarray:
         """(n,) rad: where the soft start ends."""
@@ -130,6 +143,7 @@ class SkillPlayer:
         if self.stage == Stage.ENGAGE and now - self._engaged >= self.engage_time:
             self.stage = Stage.RUN
             self._begin(now)
+        self.command.object_time = now - self.object_age
         if self.stage == Stage.STANDBY:
             self._standby(state)
         elif self.stage == Stage.ENGAGE:
@@ -149,9 +163,10 @@ class SkillPlayer:
         plan, c = self.plans[self.policy_index], self.command
         elapsed = now - self._engaged
         gain = min(1.0, elapsed / self.gain_time)
-        s = min(1.0, max(0.0, (elapsed - self.gain_time) / self.move_time))
-        ease = s * s * (3 - 2 * s)  # starts and ends at rest
-        c.joint_pos[:] = self._from + ease * (plan.posture - self._from)
+        via = plan.posture if plan.approach is None else plan.approach
+        moved = _ease((elapsed - self.gain_time) / self.move_time)
+        closed = _ease((elapsed - self.gain_time - self.move_time) / self.close_time)
+        c.joint_pos[:] = self._from + moved * (via - self._from) + closed * (plan.posture - via)
         c.kp[:] = gain * plan.kp
         c.kd[:] = self.config.damping + gain * (plan.kd - self.config.damping)
 
@@ -165,6 +180,8 @@ class SkillPlayer:
             self._switch(operator.skill, now)
         else:
             self._refused_wish = None
+        if self.object_age > self.object_patience:
+            self._fall_back(now)
         p, k = self._of_label[self.skill]
         plan, policy, c = self.plans[p], self.policies[p], self.command
         fresh = now - operator.time <= self.operator_timeout
@@ -184,15 +201,31 @@ class SkillPlayer:
             self.values[first : first + len(policy.contract.skills)] = outputs["skill_value"]
         return True
 
+    def _age(self, policy: int) -> float:
+        return self.plans[policy].object.age if self.policies[policy].contract.sees_object else -np.inf
+
+    def _fall_back(self, now: float) -> None:
+        """Give way to the first skill that needs no object. Without one the gate will stop the robot."""
+        for policy in self.policies:
+            if not policy.contract.sees_object:
+                lost, refuge = self.labels[self.skill], policy.contract.default_skill
+                self.refusals.append(Refusal(lost, f"its object is out of sight; '{refuge}' takes over"))
+                self._refused_wish = lost  # said already
+                self._become(refuge, now)
+                return
+
+    def _become(self, label: str, now: float) -> None:
+        before, self.skill = self.policy_index, self.labels.index(label)
+        self._since = now
+        if self.policy_index != before:
+            self._blend_from[:] = self.command.joint_pos
+            self._blend_start = now
+            self.policies[self.policy_index].reset()
+
     def _switch(self, wish: str, now: float) -> None:
         reason = self._objection(wish, now)
         if reason is None:
-            before, self.skill = self.policy_index, self.labels.index(wish)
-            self._since = now
-            if self.policy_index != before:
-                self._blend_from[:] = self.command.joint_pos
-                self._blend_start = now
-                self.policies[self.policy_index].reset()
+            self._become(wish, now)
         elif self._refused_wish != wish:  # say it once, not at 50 Hz
             self.refusals.append(Refusal(wish, reason))
         self._refused_wish = wish if reason else None
@@ -208,6 +241,8 @@ class SkillPlayer:
         if now - self._since < here.dwell:
             return f"'{current}' lasts at least {here.dwell:g} s"
         q, j = self._of_label[self.labels.index(wish)]
+        if self._age(q) > self.object_patience:
+            return "its object is out of sight"
         least = self.policies[q].contract.skills[j].value_min
         value = self.values[self.labels.index(wish)]
         if least is not None and np.isfinite(value) and value < least:
@@ -215,11 +250,35 @@ class SkillPlayer:
         return None
 
 
+def object_for(contracts: Sequence[Contract]) -> Object | None:
+    """The object that ``contracts`` are about; None: none is. Raises Sim2realError where they are about two."""
+    objects = [c.object for c in contracts if c.object is not None]
+    if different := [o for o in objects if o != objects[0]]:
+        raise Sim2realError(
+            f"policies: trained with {objects[0]!r} and with {different[0]!r}, expected one object in a run"
+        )
+    return objects[0] if objects else None
+
+
+def tracker_for(contracts: Sequence[Contract]) -> ObjectTracker | None:
+    """A tracker of their object, if one of ``contracts`` asks where it is. Raises as ``object_for``."""
+    thing = object_for(contracts)
+    if thing is None or not any(contract.sees_object for contract in contracts):
+        return None
+    return ObjectTracker(thing.radius, restitution=thing.restitution)
+
+
+def _ease(s: float) -> float:
+    """From 0 to 1 while ``s`` goes there, starting and ending at rest."""
+    s = min(1.0, max(0.0, s))
+    return s * s * (3 - 2 * s)
+
+
 class _Plan:
     """How one policy's tensors map onto the robot's joints; buffers for its inputs."""
 
-    def __init__(self, config: RobotConfig, contract: Contract, tracker: ObjectTracker | None = None):
-        self.object = tracker.current if tracker is not None else ObjectEstimate()
+    def __init__(self, config: RobotConfig, contract: Contract, seen: ObjectEstimate):
+        self.object = seen
         self.observed = config.indices(contract.joint_names)
         self.targets = config.indices(contract.target_joint_names)
         self.posture = config.home_pos.copy()
@@ -229,6 +288,10 @@ class _Plan:
             i = config.indices([name])[0]
             self.posture[i], self.kp[i], self.kd[i] = hold.position, hold.kp, hold.kd
         self.posture[self.observed] = contract.default_joint_pos
+        self.approach: np.ndarray | None = None
+        if contract.approach_joint_pos:
+            self.approach = self.posture.copy()
+            self.approach[self.observed] = contract.approach_joint_pos
         self.kp[self.targets] = contract.kp
         self.kd[self.targets] = contract.kd
         self._low = np.array(contract.command_velocity_min)
@@ -238,11 +301,6 @@ class _Plan:
         if strangers := [n for n in signals if n not in _SOURCES]:
             raise Sim2realError(
                 f"{contract.name}: nothing on this robot measures {', '.join(strangers)}; it measures {', '.join(_SOURCES)}"
-            )
-        if tracker is None and (objects := [n for n in signals if n in OBJECT]):
-            raise Sim2realError(
-                f"{contract.name}: needs {' and '.join(objects)}, and nothing tracks an object in this run;"
-                " give it a tracker, with a camera or motion capture that sends sightings (sim2real/object/packet.py)"
             )
         self._sources = [(_SOURCES[name], self.inputs[name]) for name in signals]
 
@@ -298,5 +356,4 @@ _SOURCES = {
     "object_velocity_in_base": _object_velocity,
 }
 assert set(_SOURCES) <= set(INPUTS)
-OBJECT = ("object_position_in_base", "object_velocity_in_base")  # these need a tracker
 MEASURED = tuple(_SOURCES)  # the signals that a robot can feed a policy

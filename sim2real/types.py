@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -50,6 +51,7 @@ class JointCommand:
     joint_torque: np.ndarray  # (n,) N m, feed-forward
     kp: np.ndarray  # (n,) N m/rad
     kd: np.ndarray  # (n,) N m s/rad
+    object_time: float = math.inf  # s, when the object it rests on was last seen; inf: it rests on none, -inf: never
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import sys
 from pathlib import Path
 
-from sim2real.clock import tune
+from sim2real.clock import MonotonicClock, tune
+from sim2real.object.camera import SimCamera
+from sim2real.object.scene import prepare_for
 from sim2real.run import Life, RunSpec, tell
 
 PRIORITY = 60  # below the guardian's and the pilot's; on whichever CPU they leave free
@@ -17,6 +21,7 @@ def main(directory: Path) -> int:
     from drivers.sim.serve import serve
     from sim2real.simulation import SETTLE
 
+    timestep = 0.002
     life = Life()
     spec = RunSpec.load(directory)
     config, wiring = spec.open()
@@ -25,17 +30,33 @@ def main(directory: Path) -> int:
         config.base,
         wiring.bus_specs(),
         wiring.imu_spec(),
+        timestep=timestep,
         seed=spec.seed,
         faults=spec.faults,
+        prepare=prepare_for(spec.object, timestep),
         joint_pos=dict(zip(config.joint_names, config.home_pos, strict=True)),
     )
     world.advance(SETTLE)
     if spec.tune:  # real motors do not wait for other programs either
         tune(PRIORITY, spin=0.0)
+    camera = SimCamera(seed=spec.seed) if spec.camera else None
+    wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    wire.setblocking(False)
     said = False
+
+    def look() -> None:
+        """The camera sees, and its computer sends. A receiver that is gone or slow costs nothing."""
+        if camera is None or spec.camera is None:
+            return
+        now = MonotonicClock.now()  # the world keeps to it
+        camera.watch(world, now)
+        for datagram in camera.sent(now):
+            with contextlib.suppress(OSError):
+                wire.sendto(datagram, spec.camera)
 
     def goes_on() -> bool:
         nonlocal said
+        look()
         if not said:  # only now does anybody listen
             tell("ready", ready=True)
             said = True

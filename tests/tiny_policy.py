@@ -28,6 +28,16 @@ tiny (float[1,{n}] joint_pos, float[1,1] carry_count) => (float[1,{n}] joint_pos
 """
 
 
+SEEING = (
+    TEXT.replace("joint_pos,", "joint_pos, float[1,3] object_position_in_base,", 1)
+    .replace(
+        "    moved",
+        "    ignored = MatMul (object_position_in_base, blind)\n    there = Add (drift, ignored)\n    moved",
+    )
+    .replace("(pulled, drift)", "(pulled, there)")
+)
+
+
 def weights(n: int) -> np.ndarray:
     """(n, n) float32, small."""
     return (0.05 * np.random.default_rng(1).normal(size=(n, n))).astype(np.float32)
@@ -38,6 +48,8 @@ def model(robot: RobotConfig, text: str = TEXT) -> onnx.ModelProto:
     n = len(robot.joint_names)
     graph = onnx.parser.parse_graph(text.format(n=n))
     values = {"weights": weights(n), "rate": 0.001, "default": robot.home_pos[None], "one": 1.0}
+    if "blind" in text:
+        values["blind"] = np.zeros((3, n))
     graph.initializer.extend(onnx.numpy_helper.from_array(np.asarray(v, np.float32), k) for k, v in values.items())
     return onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
 
@@ -71,6 +83,17 @@ def document(robot: RobotConfig) -> dict[str, Any]:
         "golden": golden,
         "provenance": {"source": "a test", "licence": "Apache-2.0"},
     }
+
+
+def seeing(robot: RobotConfig, **start: Any) -> tuple[onnx.ModelProto, dict[str, Any]]:
+    """The same, fed where a ball is, which it ignores; graph and contract. ``start``: how its skill finds the ball."""
+    contract = document(robot)
+    contract["inputs"]["object_position_in_base"] = [3]
+    for golden in contract["golden"]:
+        golden["inputs"]["object_position_in_base"] = [[0.5, 0.0, 0.0]] * STEPS
+    contract["object"] = {"radius": 0.09, "mass": 0.62, "restitution": 0.8}
+    contract["skills"][0]["object"] = start
+    return model(robot, SEEING), contract
 
 
 def write(path: Path, graph: onnx.ModelProto, contract: dict[str, Any] | str, **more: str) -> Path:

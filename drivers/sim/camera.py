@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 
 from drivers.bus import BusError
+from drivers.sim.ball import ball
 from drivers.sim.plant import Plant
 
 HINT = "install libegl1 and libgl1-mesa-dri and set MUJOCO_GL=egl, or libosmesa6 and MUJOCO_GL=osmesa"
@@ -87,7 +88,10 @@ class _Shown:
         if visuals is None:
             return
         try:
-            self.model = mujoco.MjModel.from_xml_path(str(visuals))
+            spec = mujoco.MjSpec.from_file(str(visuals))
+            if plant.ball is not None:
+                ball(0.002, radius=plant.ball.radius)(spec)
+            self.model = spec.compile()
         except ValueError as error:
             raise BusError(f"visuals {visuals}: {error}; expected an MJCF that MuJoCo can load") from None
         self._data = mujoco.MjData(self.model)

@@ -11,6 +11,7 @@ FREQUENCY = 3.0  # Hz: the robot on its rope bobs at this; it then hangs g / (2 
 DAMPING_RATIO = 0.7
 PLANAR_RATIO = 0.1  # the hook gives way sideways with this share of the vertical stiffness
 SWING_DAMPING = 0.5  # N m s/rad per kg m^2: straps rub, so hanging robots stop swinging
+STEADYING = 1.0  # m, of its own weight, per rad: hands that keep the robot upright, or arms held out would tip it back
 GYRATION = 0.25  # m, the radius of gyration that turns mass into the inertia used above
 
 
@@ -31,6 +32,7 @@ class Gantry:
         self._stiffness = mass * omega**2
         self._damping = 2 * DAMPING_RATIO * mass * omega
         self._swing_damping = SWING_DAMPING * mass * GYRATION**2 * omega
+        self._steadying = STEADYING * mass * GRAVITY
         self._stretch = GRAVITY / omega**2
 
     def hang(self, hook_in_world: np.ndarray, travel: float = 0.3) -> None:
@@ -54,9 +56,12 @@ class Gantry:
         self.engaged = False
         self._rate = 0.0
 
-    def wrench(self, hook: np.ndarray, velocity: np.ndarray, angular_velocity: np.ndarray, timestep: float):
+    def wrench(
+        self, hook: np.ndarray, velocity: np.ndarray, angular_velocity: np.ndarray, up: np.ndarray, timestep: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Force on the hook (3,) N and torque (3,) N m, in the world, for a hook at ``hook`` (3,) moving at ``velocity``
-        (3,) m/s on a body turning at ``angular_velocity`` (3,) rad/s; winds the winch on by ``timestep``."""
+        (3,) m/s on a body turning at ``angular_velocity`` (3,) rad/s whose own up is ``up`` (3,); winds the winch on by
+        ``timestep``."""
         self.height = max(self.height - self._rate * timestep, min(self.lowest, self.height))
         stretch = self.height - float(hook[2])
         pull = max(0.0, self._stiffness * stretch - self._damping * float(velocity[2])) if stretch > 0 else 0.0
@@ -69,4 +74,5 @@ class Gantry:
                 pull,
             ]
         )
-        return force, (-taut * self._swing_damping) * angular_velocity
+        upright = self._steadying * np.array([float(up[1]), -float(up[0]), 0.0])  # up x z
+        return force, taut * (upright - self._swing_damping * angular_velocity)

@@ -1,6 +1,6 @@
 """The body of the simulated robot: a MuJoCo model whose joints are driven by motors and whose base carries an IMU.
 
-The only file of ``drivers`` that knows MuJoCo. The model's own actuators, sensors and keyframes are replaced: every
+The model's own actuators, sensors and keyframes are replaced: every
 joint named gets one motor with the law ``torque = bias - kp q - kd dq``, clipped to the joint's torque limit and
 evaluated by MuJoCo inside every substep, implicitly in velocity (``implicitfast``). A real motor runs that law at
 10 kHz or more, so sampling kd once in 2 ms would be the cruder model.
@@ -21,6 +21,7 @@ import mujoco
 import numpy as np
 
 from drivers.bus import BusError
+from drivers.sim.ball import ball_of
 from drivers.sim.gantry import Gantry
 from drivers.sim.truth import Truth
 
@@ -73,6 +74,7 @@ class Plant:
         self._bolted = bool(model.body_weldid[model.site(IMU_SITE).bodyid[0]] == 0)
         self._qpos, self._qvel = data.qpos, data.qvel
         self._stood = 0.0
+        self.ball = ball_of(model, data)
         self.limit(np.full(len(joints), UNLIMITED))
         self.reset()
 
@@ -174,7 +176,7 @@ class Plant:
         hook = d.xpos[b] + d.xmat[b].reshape(3, 3) @ self._hook_in_body
         spin = d.cvel[b, :3]
         velocity = d.cvel[b, 3:] + _cross(spin, hook - d.subtree_com[self._root])
-        force, torque = self.gantry.wrench(hook, velocity, spin, self.timestep)
+        force, torque = self.gantry.wrench(hook, velocity, spin, d.xmat[b, 2::3], self.timestep)
         d.xfrc_applied[b, :3] = force
         d.xfrc_applied[b, 3:] = torque + _cross(hook - d.xipos[b], force)
 
@@ -262,6 +264,8 @@ class Plant:
             angular_velocity_base_in_base=spin,
             tilt=self.tilt,
             fallen=self.fallen,
+            position_object_in_world=self.ball.position if self.ball else None,
+            velocity_object_in_world=self.ball.velocity if self.ball else None,
         )
 
 

@@ -176,6 +176,15 @@ class WorldRemote:
     def push(self, velocity_delta: Sequence[float]) -> None:
         self.call("push", velocity_delta=[float(v) for v in velocity_delta])
 
+    def carry_ball(self, position: Sequence[float]) -> None:
+        self.call("carry_ball", position=[float(v) for v in position])
+
+    def throw_ball(self, position: Sequence[float], velocity: Sequence[float]) -> None:
+        self.call("throw_ball", position=[float(v) for v in position], velocity=[float(v) for v in velocity])
+
+    def let_go_ball(self) -> None:
+        self.call("let_go_ball")
+
     def inject(self, fault: str) -> None:
         """A fault in its text form; its times are those of the World (``status()['time']``)."""
         self.call("inject", fault=fault)

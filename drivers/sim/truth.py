@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Truth:
-    """The base in the world, as the simulation has it."""
+    """The base, and the object where there is one, in the world as the simulation has it."""
 
     time: float  # s
     position_base_in_world: np.ndarray  # (3,) m
@@ -18,3 +18,5 @@ class Truth:
     angular_velocity_base_in_base: np.ndarray  # (3,) rad/s
     tilt: float  # rad between the base's up and the world's
     fallen: bool
+    position_object_in_world: np.ndarray | None = None  # (3,) m; None: there is no object
+    velocity_object_in_world: np.ndarray | None = None  # (3,) m/s

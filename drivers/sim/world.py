@@ -25,6 +25,7 @@ import numpy as np
 from drivers.budget import bits_of
 from drivers.bus import BusError, BusSpec, ImuSpec
 from drivers.open import PROTOCOLS, load
+from drivers.sim.ball import Ball
 from drivers.sim.faults import IMU, POWER, Fault, parse_fault
 from drivers.sim.imu import ImuNoise, SimImu, SimSerialWire
 from drivers.sim.motor import MotorEvent, SimMotors
@@ -225,6 +226,24 @@ class World:
     def release(self) -> None:
         """Unhook the gantry."""
         self.plant.release()
+
+    def carry_ball(self, position: Sequence[float]) -> None:
+        """A person holds the ball at ``position`` (3,) m in the world."""
+        self._ball.carry(position)
+
+    def throw_ball(self, position: Sequence[float], velocity: Sequence[float]) -> None:
+        """The ball flies from ``position`` (3,) m with ``velocity`` (3,) m/s in the world."""
+        self._ball.throw(position, velocity)
+
+    def let_go_ball(self) -> None:
+        """Nobody holds the ball any more."""
+        self._ball.let_go()
+
+    @property
+    def _ball(self) -> Ball:
+        if self.plant.ball is None:
+            raise BusError("ball: there is none in this world; expected one made with add_ball and add_person")
+        return self.plant.ball
 
     # -- what happened -----------------------------------------------------------------------------------------------
 

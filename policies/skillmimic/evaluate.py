@@ -106,6 +106,13 @@ class Result(NamedTuple):
     contact_error: float
 
 
+def result(success: np.ndarray, sums: np.ndarray, frames: np.ndarray) -> Result:
+    """What episodes amount to: ``success`` (episodes,) in [0, 1], ``sums`` (episodes, 4) of Measures over ``frames``
+    (episodes,) each."""
+    body, ball, contact, right = (sums.sum(axis=0) / frames.sum()).tolist()
+    return Result(Rate(round(float(success.sum())), len(success)), right, body, ball, contact)
+
+
 def evaluate(
     graph: PolicyGraph,
     episodes: int,
@@ -146,7 +153,7 @@ def evaluate_skill(
     env.episode_length_buf[:] = 0
     act = act or (lambda e: graph.actor(e.observation))
     running, up = np.full(episodes, True), np.full(episodes, True)
-    sums, frames = np.zeros(len(Measures._fields)), 0
+    sums, frames = np.zeros((episodes, len(Measures._fields))), np.zeros(episodes)
     rows: list[Trace] = []
     with torch.no_grad():
         while running.any():
@@ -158,14 +165,13 @@ def evaluate_skill(
             if rows:  # an episode that is over stays as it ended
                 now = Trace(*(np.where(_like(running, new), new, old) for new, old in zip(now, rows[-1], strict=True)))
             rows.append(now)
-            sums += [values[running].sum() for values in row]
-            frames += int(running.sum())
+            sums[running] += np.stack(row, axis=1)[running]
+            frames += running
             running &= ~dones.numpy().astype(bool)
     rows += rows[-1:] * (config.frames - len(rows))
     trace = Trace(*(np.stack(values) for values in zip(*rows, strict=True)))
     shares = RULES.get(skill, _kept)(trace, config.period)
-    body, ball, contact, right = (sums / frames).tolist()
-    return Result(Rate(round(float(shares.sum())), episodes), right, body, ball, contact)
+    return result(shares, sums, frames)
 
 
 def _like(chosen: np.ndarray, values: np.ndarray) -> np.ndarray:

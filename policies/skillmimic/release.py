@@ -5,18 +5,29 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from drivers.sim import ball
+from policies.clips.kinematics import conjugate, quaternion_from_rotation_vector, rotate
+from policies.clips.library import robot_clips
 from policies.evaluate import UNSEEN
 from policies.export import envelope, export
+from policies.skillmimic.clips import PRESS, grip
+from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.train import load_graph
 from policies.training import git_revision
+from sim2real.contract import Contract
 from sim2real.policy import Policy
+from sim2real.types import Sim2realError
 
+SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "walks", "period", "timestep", "action_ratio", "action_max", "grip", "balance_gain",
+            "balance_damping", "position_margin", "history", "frames", "terminations")  # fmt: skip
+OPEN = 0.05  # m
 GOLDEN_STEPS, GOLDEN = 40, 4  # ticks of each golden sequence, and how many
 
 
@@ -48,10 +59,15 @@ def export_graph(
         "joint_names": list(robot.joint_names),
         "target_joint_names": list(robot.joint_names),
         "default_joint_pos": graph.postures[0].tolist(),
+        "approach_joint_pos": approach(graph, 0),
         "kp": robot.home_kp.tolist(),
         "kd": robot.home_kd.tolist(),
         "action_scale": graph.scale.tolist(),
-        "skills": [{"label": label, "description": f"{label}, from retargeted clips"} for label in graph.labels],
+        "object": {"kind": "ball", "radius": ball.RADIUS, "mass": ball.MASS, "restitution": ball.RESTITUTION},
+        "skills": [
+            {"label": label, "description": f"{label}, from retargeted clips", "object": object_start(graph, clip)}
+            for label, clip in zip(graph.labels, first_clips(graph), strict=True)
+        ],
         "default_skill": graph.labels[0],
         "history": f"{config.history} ticks, carried in carry_history",
         "envelope": envelope(seen),
@@ -64,12 +80,68 @@ def export_graph(
                 "algorithm": "PPO (rsl_rl)",
                 "variant": config.variant,
                 "seed": config.seed,
-                "timestep": config.timestep,
+                "settings": settings(config),
                 **(measured or {}),
             },
         },
     }
     return export(graph, path, fields=fields, sequences=sequences)
+
+
+def settings(config: SkillMimic) -> str:
+    """What it takes to build the graph and its clips again (``graph_of``), as JSON."""
+    return json.dumps({name: getattr(config, name) for name in SETTINGS})
+
+
+def graph_of(contract: Contract) -> PolicyGraph:
+    """The graph that ``contract``'s file was exported from, without its actor. Raises Sim2realError where it does not say."""
+    text = contract.provenance.training.get("settings")
+    if not isinstance(text, str):
+        raise Sim2realError(f"{contract.name}: its provenance has no 'settings': export it again (sim2real export)")
+    fields = {name: tuple(v) if isinstance(v, list) else v for name, v in json.loads(text).items()}
+    return PolicyGraph(SkillMimic(**fields))
+
+
+def first_clips(graph: PolicyGraph) -> list[int]:
+    """Of every skill, the number of its first clip."""
+    return [int(np.flatnonzero(graph.clips.skill == k)[0]) for k in range(len(graph.labels))]
+
+
+def object_start(graph: PolicyGraph, clip: int) -> dict[str, Any]:
+    """How the skill of clip number ``clip`` finds the ball there: a contract.ObjectStart.
+
+    In the hands if any of them is on it at the start: then at its mean place while hands are on it, which is where they
+    are in the posture that the soft start ends in. Else lying or flying, as in the first frame.
+    """
+    clips = graph.clips
+    rows = clips.first[clip] + np.arange(clips.length[clip])
+    m = clips.motion(rows, np.ones(len(rows)))
+    base, turn, position, velocity = m.points[:, 0], m.orientation_base_in_world, m.object_position, m.object_velocity
+    held = m.contact[:, 0] > 0
+    if held[0]:
+        return {"how": "held", "position": _rounded(rotate(conjugate(turn), position - base)[held].mean(axis=0))}
+    ahead = rotate(turn[0], np.array([1.0, 0.0, 0.0]))
+    back = quaternion_from_rotation_vector(np.array([0.0, 0.0, -np.arctan2(ahead[1], ahead[0])]))
+    place = rotate(back, position[0] - base[0] * [1.0, 1.0, 0.0])
+    if place[2] < 1.5 * ball.RADIUS and np.linalg.norm(velocity[0]) < 0.3:
+        return {"how": "placed", "position": _rounded(np.array([*place[:2], ball.RADIUS]))}
+    return {"how": "thrown", "position": _rounded(place), "velocity": _rounded(rotate(back, velocity[0]))}
+
+
+def approach(graph: PolicyGraph, skill: int) -> list[float]:
+    """(n,) rad, the posture of ``skill`` with the palms ``OPEN`` off the ball, for hands that then close on it from both
+    sides; empty where it does not begin with both palms on the ball."""
+    clip = next(c for c in robot_clips(graph.config.robot, graph.labels[skill]) if c.name in graph.clips.names)
+    both = clip.contact[:, :2].all(axis=1)
+    if not both[0]:
+        return []
+    g = grip(clip, graph.model, graph.body, graph.kp, force=0.0)
+    posture = (clip.joint_pos + g.effort - g.press * (OPEN / PRESS))[both].mean(axis=0)
+    return np.clip(posture, graph.lower.numpy(), graph.upper.numpy()).tolist()
+
+
+def _rounded(vector: np.ndarray) -> list[float]:
+    return [round(v, 4) for v in vector.tolist()]
 
 
 def record(graph: PolicyGraph) -> tuple[list[dict[str, np.ndarray]], list[dict[str, np.ndarray]]]:

@@ -32,7 +32,9 @@ class Args:
     wiring: str = ""
     """which of the robot's wirings; default: its default"""
     policy: tyro.conf.UseAppendAction[list[Path]] = field(default_factory=list)
-    """policy files; default: those the robot's YAML names"""
+    """policy files; default: those of --skills"""
+    skills: str = ""
+    """which of the sets of skills that the robot's YAML names; default: its default"""
     skill: str = ""
     """perform only this skill"""
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -61,6 +63,8 @@ class Args:
     """with lockstep: render the run to this .gif"""
     visuals: Path | None = None
     """with --video: an MJCF to show instead, such as the maker's with its meshes (joints matched by name)"""
+    sightings: str = ""
+    """with --hardware: UDP address at which sightings of the object are awaited, HOST:PORT; default 127.0.0.1:47201"""
     untuned: bool = False
     """do not ask the kernel for real-time scheduling"""
     hardware: bool = False
@@ -105,6 +109,9 @@ def _check(args: Args, config: RobotConfig) -> None:
         raise Sim2realError("--hardware with --fault, --video or --hang: those exist only in simulation; drop them")
     if args.calibration and not args.hardware:
         raise Sim2realError("--calibration without --hardware: simulated motors are where the YAML says; drop it")
+    if args.sightings and not args.hardware:
+        raise Sim2realError("--sightings without --hardware: a simulated robot has its own camera; drop it")
+    _address(args.sightings)
     if args.visuals and not args.video:
         raise Sim2realError("--visuals without --video: nothing would be shown; add --video FILE.gif")
     if args.video and args.clock != "lockstep":
@@ -113,21 +120,28 @@ def _check(args: Args, config: RobotConfig) -> None:
         raise Sim2realError("--operator keyboard with --clock lockstep: nobody types that fast; use --clock realtime")
     if (args.velocity != (0.0, 0.0, 0.0) or args.duration) and not args.skill:
         raise Sim2realError("--velocity and --duration belong to one skill: add --skill, or write a --script")
+    if args.skills and args.policy:
+        raise Sim2realError("--skills and --policy: got both, expected one; --policy may be given more than once")
     if args.skill and args.script:
         raise Sim2realError("--skill and --script: got both, expected one")
     config.wiring(args.wiring)
+
+
+def _address(text: str) -> tuple[str, int]:
+    """``HOST:PORT``; empty: the default."""
+    from sim2real.object.packet import ADDRESS
+
+    host, _, port = text.rpartition(":")
+    if text and not (host and port.isdecimal() and 0 < int(port) < 65536):
+        raise Sim2realError(f"--sightings: got '{text}', expected HOST:PORT, e.g. 0.0.0.0:47201")
+    return (host, int(port)) if text else ADDRESS
 
 
 def _policies(args: Args, config: RobotConfig, console: Console):
     from sim2real.policy import load_policy
 
     root = Path(__file__).resolve().parents[2]
-    paths = args.policy or [root / entry.file for entry in config.policies.values()]
-    if not paths:
-        raise Sim2realError(
-            f"{config.name}: its YAML names no policy; give one with --policy FILE.onnx; for a first that holds its home "
-            f"posture: sim2real posture --robot {args.robot} -o FILE.onnx"
-        )
+    paths = args.policy or [root / entry.file for entry in config.skill_set(args.skills)]
     policies = [load_policy(path, config) for path in paths]
     for policy in policies:
         contract = policy.contract
@@ -225,9 +239,9 @@ def _lockstep(args, config, player, policies, operator, record, console):
 
     sink = None
 
-    def sink_for(ticks, pilots):
+    def sink_for(layouts):
         nonlocal sink
-        sink = Direct(record, {"/tick": ticks, "/pilot": pilots}, *_about(args, config, policies))
+        sink = Direct(record, layouts, *_about(args, config, policies))
         return sink
 
     simulation = Simulation(
@@ -259,15 +273,13 @@ def _realtime(args, config, player, policies, operator, record, console):
     from sim2real.console import Status
     from sim2real.launch import Launch
     from sim2real.operators.keyboard import KEYS
-    from sim2real.pilot import layout_of
+    from sim2real.pilot import topics
     from sim2real.recorder.process import Recorder
-    from sim2real.records import tick_layout
 
     recorder = None
     if record:
         buses = [b.name for b in config.wiring(args.wiring).buses]
-        layouts = {"/tick": tick_layout(config.joint_names, buses), "/pilot": layout_of(player)}
-        recorder = Recorder(record, layouts, *_about(args, config, policies))
+        recorder = Recorder(record, topics(config, buses, player), *_about(args, config, policies))
     try:
         with Status(console, KEYS if args.operator == "keyboard" else "") as status:
             launch = Launch(
@@ -281,6 +293,7 @@ def _realtime(args, config, player, policies, operator, record, console):
                 seed=args.seed,
                 faults=args.fault,
                 recorder=recorder,
+                sightings=_address(args.sightings),
                 show=status.show,
                 hang=args.hang,
                 timeout=10.0 if args.operator == "script" else 3600.0,

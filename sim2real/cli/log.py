@@ -192,6 +192,9 @@ def _print_summary(console: Console, s) -> None:
         for b in s.buses
     ]
     console.print(_table("", ("bus", "load", "max", "sent", "received", "rejected", "lost"), rows))
+    if s.object is not None:
+        row = (f"{s.object.used} of {s.object.sightings}", *(f"{1e3 * value:.0f}" for value in s.object.age.values()))
+        console.print(_table("", ("sightings used", "age p50 ms", "p99", "p99.9", "max"), [row]))
     rows = [
         (
             j.name,

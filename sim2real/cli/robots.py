@@ -37,6 +37,7 @@ def describe(robot: RobotConfig) -> dict[str, Any]:
             }
             for name, wiring in robot.wirings.items()
         },
+        "skills": robot.skills,
         "policies": {name: entry.description for name, entry in robot.policies.items()},
     }
 

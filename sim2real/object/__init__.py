@@ -1,1 +1,1 @@
-"""Where samples of the object come from: packets on the network, or a simulated camera."""
+"""Where samples of the object come from: packets on the network, or a simulated camera; and the object of a simulation."""

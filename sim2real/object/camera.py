@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sim2real.object.packet import Receiver, encode
 from sim2real.tracker import ObjectSample, rotate
 
 if TYPE_CHECKING:
@@ -26,13 +27,16 @@ class CameraModel:
 
 
 class SimCamera:
-    """``expose`` at least as often as ``model.rate``; ``read(now)`` gives what has arrived by then."""
+    """``expose`` at least as often as ``model.rate``; ``sent(now)`` are the datagrams that have left it by then, and
+    ``read(now)`` what they say, for whoever is in the same process."""
 
     def __init__(self, model: CameraModel | None = None, seed: int = 0) -> None:
         self.model = model or CameraModel()
         self._rng = np.random.default_rng(seed)
         self._next = -np.inf
-        self._coming: deque[tuple[float, ObjectSample]] = deque()
+        self._exposures = 0
+        self._coming: deque[tuple[float, bytes]] = deque()
+        self._receiver = Receiver()
 
     def expose(self, now: float, position: np.ndarray, base: np.ndarray, orientation: np.ndarray) -> None:
         """Perhaps take a picture: object and base (3,) m and the base's orientation (4,), in the world, at ``now`` s."""
@@ -43,17 +47,26 @@ class SimCamera:
         lost, delay = rng.random() < m.loss, m.latency + m.jitter * rng.random()
         seen = rotate(orientation * [1.0, -1.0, -1.0, -1.0], position - base) + m.noise * rng.standard_normal(3)
         if not lost:
-            self._coming.append((now + delay, ObjectSample(now, seen)))
+            self._coming.append((now + delay, encode(self._exposures, now, seen)))
+        self._exposures += 1
 
-    def read(self, now: float) -> list[ObjectSample]:
-        """Samples that have arrived by ``now`` (s), in the order of their exposure."""
+    def sent(self, now: float) -> list[bytes]:
+        """Datagrams that have left by ``now`` (s), in the order of their exposure."""
         found = []
         while self._coming and self._coming[0][0] <= now:
             found.append(self._coming.popleft()[1])
         return found
 
-    def watch(self, world: World, name: str = "ball") -> None:
-        """Perhaps take a picture of the body ``name`` of a simulated world."""
+    def read(self, now: float) -> list[ObjectSample]:
+        """The same, decoded."""
+        return [sample for data in self.sent(now) if (sample := self._receiver.take(data)) is not None]
+
+    def watch(self, world: World, now: float | None = None) -> None:
+        """Perhaps take a picture of the ball of a simulated world; ``now``: by whose clock, if not the world's."""
+        now = world.time if now is None else now
+        if now < self._next - 1e-9:
+            return
         truth = world.truth()
-        position = world.plant.data.body(name).xpos
-        self.expose(world.time, position.copy(), truth.position_base_in_world, truth.orientation_base_in_world)
+        if truth.position_object_in_world is not None:
+            base, orientation = truth.position_base_in_world, truth.orientation_base_in_world
+            self.expose(now, truth.position_object_in_world, base, orientation)

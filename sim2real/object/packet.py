@@ -86,22 +86,52 @@ class Received:
     missing: int = 0
 
 
-class UdpSightings:
-    """Listens for sightings; ``read`` never blocks. Raises PacketError where the port is taken."""
+class Receiver:
+    """Turns datagrams into sightings, in order; ``received`` counts what they were."""
+
+    def __init__(self) -> None:
+        self.received = Received()
+        self._newest: int | None = None
+
+    def take(self, data: bytes) -> ObjectSample | None:
+        """The sighting in ``data``; None: it is none, or not newer than one before."""
+        try:
+            sequence, sample = decode(data)
+        except PacketError:
+            self.received.bad += 1
+            return None
+        if self._newest is not None:
+            step = (sequence - self._newest) & 0xFFFFFFFF
+            if step == 0 or step >= 0x80000000:
+                self.received.disordered += 1
+                return None
+            self.received.missing += step - 1
+        self._newest = sequence
+        self.received.good += 1
+        return sample
+
+
+def listen(address: tuple[str, int] = ADDRESS) -> socket.socket:
+    """A UDP socket bound to ``address``. Raises PacketError where the port is taken, or no such address is ours."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        sock.bind(address)
+    except OSError as error:
+        sock.close()
+        raise PacketError(f"udp {address[0]}:{address[1]}: {error.strerror}, expected a free port") from None
+    return sock
+
+
+class UdpSightings(Receiver):
+    """Sightings that come to a socket of ``listen``; ``read`` never blocks."""
 
     most = 64  # datagrams a read: a flood must not hold up a tick
 
-    def __init__(self, address: tuple[str, int] = ADDRESS) -> None:
-        self.received = Received()
-        self._newest: int | None = None
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    def __init__(self, sock: socket.socket) -> None:
+        super().__init__()
+        self._socket = sock
         self._socket.setblocking(False)
-        try:
-            self._socket.bind(address)
-        except OSError as error:
-            self._socket.close()
-            raise PacketError(f"udp {address[0]}:{address[1]}: {error.strerror}, expected a free port") from None
-        self.address: tuple[str, int] = self._socket.getsockname()
+        self.address: tuple[str, int] = sock.getsockname()
 
     def read(self, now: float = 0.0) -> list[ObjectSample]:
         """What has arrived, oldest first; ``now`` is not needed: packets tell their own time."""
@@ -111,20 +141,8 @@ class UdpSightings:
                 data = self._socket.recv(LAYOUT.size + 1)
             except BlockingIOError:
                 break
-            try:
-                sequence, sample = decode(data)
-            except PacketError:
-                self.received.bad += 1
-                continue
-            if self._newest is not None:
-                step = (sequence - self._newest) & 0xFFFFFFFF
-                if step == 0 or step >= 0x80000000:
-                    self.received.disordered += 1
-                    continue
-                self.received.missing += step - 1
-            self._newest = sequence
-            self.received.good += 1
-            found.append(sample)
+            if (sample := self.take(data)) is not None:
+                found.append(sample)
         return found
 
     def close(self) -> None:

@@ -45,7 +45,7 @@ svg text { fill: var(--ink); } .tick { fill: var(--soft); font-variant-numeric: 
 .grid, .rule { stroke: var(--line); stroke-width: 1; } .rule { stroke: var(--card); } .axis { stroke: var(--soft); }
 .measured, .commanded, .load { fill: none; stroke-linejoin: round; stroke-width: 5.5; stroke: var(--blue); }
 .commanded { stroke: var(--target); stroke-width: 7; } .limit { stroke: var(--red); stroke-dasharray: 3 3; }
-.bar { fill: var(--blue); } image { image-rendering: pixelated; }
+.dot { fill: var(--c); opacity: 0.5; } .bar { fill: var(--blue); } image { image-rendering: pixelated; }
 .band text { fill: #fff; font-weight: 600; } .mark { stroke: var(--red); stroke-width: 2; }
 .RUN { fill: var(--run); } .HOLD { fill: var(--hold); } .DAMP { fill: var(--damp); } .OFF, .quiet { fill: var(--off); }
 .s0, .key .s0 { --c: #2a78d6; } .s1 { --c: #12805c; } .s2 { --c: #8a5fd0; } .s3 { --c: #b8621b; } .s4 { --c: #b83280; }
@@ -91,6 +91,7 @@ def page(run: Run) -> str:
                 '<div class="key"><span><i style="background:var(--target)"></i>commanded</span><span><i></i>measured</span>'
                 f'<span><i style="background:var(--red)"></i>range</span></div><div class="grid-of-joints">{_positions(run, summary)}</div>',
             ),
+            *_object(run, summary),
             *_strips(run, summary),
             _section(
                 "Lateness",
@@ -206,6 +207,46 @@ def _positions(run: Run, summary: RecordSummary) -> str:
         rmse = "" if joint.tracking_rmse is None else f"{joint.tracking_rmse:.3f} rad"
         out.append(f"<figure><figcaption>{text(joint.name)}<span>{rmse}</span></figcaption>{drawing}</figure>")
     return "".join(out)
+
+
+def _object(run: Run, summary: RecordSummary) -> list[str]:
+    """Where the object was believed to be, and how long ago it was seen."""
+    if summary.object is None:
+        return []
+    try:
+        limit = run.robot.safety.object_age
+    except ConfigError:
+        limit = np.inf
+    seen, time = run.object, run.object["time"] - run.start
+    x = (0.0, max(run.duration, 1e-6))
+    fresh = np.append(True, seen["sighting.time"][1:] != seen["sighting.time"][:-1])
+    sighted = np.where(fresh[:, None], seen["sighting.position_in_base"], np.nan)
+    taken = seen["sighting.time"] - run.start
+    place = Frame(x, bounds(seen["position_in_base"], least=0.2), 1000, 190)
+    age = Frame(x, (0.0, bounds(np.array([0.1]), seen["age"])[1]), 1000, 110)
+    axes, colours = range(3), ("s0", "s1", "s3")
+    dots = "".join(
+        f'<circle class="dot {colours[i]}" cx="{place.to_x(a):.1f}" cy="{place.to_y(b):.1f}" r="1.3"/>'
+        for i in axes
+        for a, b in zip(taken.tolist(), sighted[:, i].tolist(), strict=True)
+        if np.isfinite(b) and place.y[0] <= b <= place.y[1]
+    )
+    lines = [place.line(time, seen["position_in_base"][:, i], f"load {colours[i]}", 2) for i in axes]
+    lines = [line.replace("<path ", '<path stroke-width="3" ') for line in lines]
+    key = "".join(f'<span><i class="{colours[i]}"></i>{name}, m</span>' for i, name in enumerate("xyz"))
+    drawing = place.svg(place.grid(10, 4), dots, *lines, label="position of the object in the base over time")
+    aged = age.svg(
+        age.grid(10, 3), age.level(limit, "limit"), age.line(time, seen["age"], "measured"),
+        label="age of the object's estimate over time",
+    )  # fmt: skip
+    return [
+        _section(
+            "Object",
+            f"Believed position in the base (lines) and sightings (dots, where the base was then); below, s since it was seen. "
+            f"{summary.object.used} of {summary.object.sightings} sightings were used.",
+            f'<div class="key">{key}</div><div class="card">{drawing}{aged}</div>',
+        )
+    ]
 
 
 def _strips(run: Run, summary: RecordSummary) -> list[str]:

@@ -12,10 +12,10 @@ import numpy as np
 
 from sim2real.config import ConfigError, RobotConfig, load_robot
 from sim2real.recorder.reader import Reader
-from sim2real.records import pilot_layout, tick_layout
+from sim2real.records import object_layout, pilot_layout, tick_layout
 from sim2real.types import Sim2realError
 
-TICK, PILOT = "/tick", "/pilot"
+TICK, PILOT, OBJECT = "/tick", "/pilot", "/object"
 STAGES = ("standby", "engage", "run")  # of skills.Stage
 
 
@@ -28,7 +28,7 @@ class Span(NamedTuple):
 
 
 class Run:
-    """``tick`` (n,) and ``pilot`` (m,) are the recorded arrays; ``pilot`` may be empty. Times are seconds since the
+    """``tick`` (n,), ``pilot`` (m,) and ``object`` (k,) are the recorded arrays; the latter two may be empty. Times are seconds since the
     first tick. Raises Sim2realError as ``Reader`` does, and where the record holds no tick."""
 
     def __init__(self, path: Path | str) -> None:
@@ -46,10 +46,12 @@ class Run:
         for topic, expected in (
             (TICK, tick_layout(("x",), ("x",))),
             (PILOT, pilot_layout(("x",), {}, ("x",))),
+            (OBJECT, object_layout()),
         ):
             if topic in self.reader.topics:
                 self._same_version(topic, set(expected.dtype.names or ()))
         self.pilot: np.ndarray = self.reader[PILOT] if PILOT in self.reader.topics else np.zeros(0)
+        self.object: np.ndarray = self.reader[OBJECT] if OBJECT in self.reader.topics else np.zeros(0)
         elements = self.reader.layouts[TICK].elements
         self.joints = elements["state.joint_pos"]
         self.buses = elements["bus.load"]

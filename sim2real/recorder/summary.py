@@ -41,6 +41,15 @@ class BusSummary:
 
 
 @dataclass
+class ObjectSummary:
+    """What was seen of the object. ``age``: quantiles of the age of its estimate since it was first seen."""
+
+    sightings: int
+    used: int
+    age: dict[str, float]  # quantile -> s
+
+
+@dataclass
 class Period:
     """A stretch of the run with one mode or skill, seconds since the run began."""
 
@@ -73,6 +82,7 @@ class RecordSummary:
     timing: dict[str, dict[str, float]]  # stage -> quantile -> s
     buses: list[BusSummary]
     joints: list[JointSummary]
+    object: ObjectSummary | None = None  # None: no policy asked where it is
     notes: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
@@ -113,6 +123,7 @@ def summarise(run: Run) -> RecordSummary:
         timing=timing,
         buses=[_bus(run, i) for i in range(len(run.buses))],
         joints=_joints(run, robot),
+        object=_object(run),
         notes=notes,
     )
 
@@ -151,6 +162,13 @@ def _bus(run: Run, i: int) -> BusSummary:
     counts = {name: int(last[f"bus.{name}"][i]) for name in ("sent", "received", "rejected", "lost")}
     mean, most = (float(finite.mean()), float(finite.max())) if len(finite) else (float("nan"),) * 2
     return BusSummary(run.buses[i], mean, most, **counts)
+
+
+def _object(run: Run) -> ObjectSummary | None:
+    if not len(run.object):
+        return None
+    last = run.object[-1]
+    return ObjectSummary(int(last["sightings"]), int(last["used"]), quantiles(run.object["age"]))
 
 
 def _joints(run: Run, robot) -> list[JointSummary]:

@@ -43,6 +43,7 @@ class Evidence:
         self.gyro_repeats = math.nan  # fresh samples in a row with the same bits
         self.request = np.zeros((5, n))  # the newest command: position, velocity, torque, kp, kd
         self.command_time = -math.inf  # s, when it was decided
+        self.object_time = math.inf  # s, when the object it rests on was last seen; inf: it rests on none
 
     def see(self, state: RobotState, now: float) -> None:
         """Take in a state. One that is not of this moment makes every reading in it that much older."""
@@ -66,7 +67,7 @@ class Evidence:
     def hear(self, command: JointCommand | None) -> None:
         """Take in the newest command; None: there is none that is newer."""
         if command is not None:
-            self.command_time = command.time
+            self.command_time, self.object_time = command.time, command.object_time
             _fill(self.request, (command.joint_pos, command.joint_vel, command.joint_torque, command.kp, command.kd))
 
     def _track_jumps(self, now: float) -> None:
@@ -123,6 +124,10 @@ class Evidence:
     def command_age(self) -> float:
         """s; a command from the future is as suspect as one from the past. Counts from arming at the earliest."""
         return abs(self.now - max(self.command_time, self.armed_since))
+
+    def object_age(self) -> float:
+        """s since the object that the newest command rests on was seen; one from the future is as suspect."""
+        return 0.0 if self.object_time == math.inf else abs(self.now - self.object_time)
 
     def held_for(self) -> float:
         return self.now - self.holding_since

@@ -14,8 +14,8 @@ KP_FLOOR = 1e-6  # N m/rad: below it no reachable target makes a torque; the fin
 
 THRESHOLDS = (
     "position_overrun", "jump_ratio", "tilt", "angular_velocity", "temperature_warn", "temperature", "joint_age",
-    "imu_age", "imu_frozen", "orientation_norm", "enable_time", "command_age_hold", "command_age", "hold_time",
-    "arm_tilt", "arm_velocity", "arm_gravity", "tick_gap",
+    "imu_age", "imu_frozen", "orientation_norm", "enable_time", "command_age_hold", "command_age", "object_age",
+    "hold_time", "arm_tilt", "arm_velocity", "arm_gravity", "tick_gap",
 )  # fmt: skip
 
 
@@ -49,6 +49,7 @@ class Limits:
     enable_time: float  # s
     command_age_hold: float  # s
     command_age: float  # s
+    object_age: float  # s
     hold_time: float  # s
     arm_tilt: float  # rad
     arm_velocity: float  # rad/s

@@ -52,6 +52,11 @@ WRONG = {
     "unknown skill": (["--robot", "g1", "--policy", "POLICY", "--skill", "stadn"], "did you mean 'stand'"),
     "bad script": (["--robot", "g1", "--policy", "POLICY", "--script", "stand"], "expected LABEL:SECONDS"),
     "both": (["--robot", "g1", "--policy", "POLICY", "--skill", "stand", "--script", "stand:1"], "expected one"),
+    "unknown skills": (["--robot", "g1", "--skills", "basic"], "no skills 'basic' (did you mean 'basics'?)"),
+    "no skills": (["--robot", "bench"], "give a policy with --policy FILE.onnx"),
+    "skills and policy": (["--robot", "g1", "--skills", "basics", "--policy", "POLICY"], "expected one"),
+    "sightings": (["--robot", "g1", "--sightings", "0.0.0.0:1"], "its own camera"),
+    "no address": (["--robot", "g1", "--hardware", "--operator", "keyboard", "--sightings", "x"], "expected HOST:PORT"),
     "velocity of nothing": (["--robot", "g1", "--policy", "POLICY", "--velocity", "1", "0", "0"], "add --skill"),
     "lockstep hardware": (["--robot", "g1", "--hardware", "--clock", "lockstep"], "real time"),
     "faulty hardware": (

@@ -47,9 +47,9 @@ def record(tiny, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("run") / "g1.mcap"
     sinks = []
 
-    def sink_for(tick, pilot) -> Direct:
+    def sink_for(layouts) -> Direct:
         attachments = {"robot.yaml": robot.path.read_bytes(), "tiny.onnx": tiny.read_bytes()}
-        sinks.append(Direct(path, {"/tick": tick, "/pilot": pilot}, {"robot": "g1", "clock": "lockstep"}, attachments))
+        sinks.append(Direct(path, layouts, {"robot": "g1", "clock": "lockstep"}, attachments))
         return sinks[0]
 
     def cut_power(simulation: Simulation) -> None:
@@ -404,9 +404,9 @@ def test_two_policies_replay_through_their_blends(tmp_path):
     path = tmp_path / "two.mcap"
     sinks = []
 
-    def sink_for(tick, pilot) -> Direct:
+    def sink_for(layouts) -> Direct:
         attachments = {"robot.yaml": robot.path.read_bytes(), **{f.name: f.read_bytes() for f in files}}
-        sinks.append(Direct(path, {"/tick": tick, "/pilot": pilot}, {}, attachments))
+        sinks.append(Direct(path, layouts, {}, attachments))
         return sinks[0]
 
     steps = [Step("stand", 0.4), Step("lean", 0.4), Step("stand", 0.2)]

@@ -7,7 +7,7 @@ import socket
 import numpy as np
 import pytest
 
-from sim2real.object.packet import PacketError, UdpSightings, decode, encode
+from sim2real.object.packet import PacketError, UdpSightings, decode, encode, listen
 
 # Written out by hand from the table in the module: sequence 7, stamp 1.5 s, object at (0.5, -0.25, 1), seen from the base.
 GOLDEN = bytes.fromhex(
@@ -49,7 +49,7 @@ def test_what_is_refused(data, words):
 
 @pytest.fixture
 def wire():
-    sightings = UdpSightings(("127.0.0.1", 0))
+    sightings = UdpSightings(listen(("127.0.0.1", 0)))
     sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sender.connect(sightings.address)
     yield sightings, sender
@@ -84,4 +84,4 @@ def test_a_flood_does_not_hold_up_a_tick(wire):
 
 def test_a_taken_port_is_named(wire):
     with pytest.raises(PacketError, match="udp 127.0.0.1:.*expected a free port"):
-        UdpSightings(wire[0].address)
+        listen(wire[0].address)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from drivers.sim.ball import RADIUS
 from drivers.sim.world import World
-from policies.ball import RADIUS, ball
 from sim2real.config import load_robot
+from sim2real.contract import Object
 from sim2real.object.camera import SimCamera
+from sim2real.object.scene import prepare_for
 from sim2real.tracker import ObjectTracker, rotate
 
 
@@ -19,9 +21,10 @@ def test_a_dropped_ball_is_followed_through_its_bounces():
         robot.base,
         wiring.bus_specs(),
         wiring.imu_spec(),
-        prepare=ball(0.002, position=(0.6, 0.1, 1.2)),
+        prepare=prepare_for(Object(radius=RADIUS, mass=0.62, restitution=0.8), 0.002),
         joint_pos=dict(zip(robot.joint_names, robot.home_pos, strict=True)),
     )
+    world.throw_ball((0.6, 0.1, 1.2), (0.0, 0.0, 0.0))
     camera, tracker = SimCamera(seed=1), ObjectTracker(RADIUS, height=float(world.truth().position_base_in_world[2]))
     errors, late = [], []
     for k in range(1, 376):

@@ -122,6 +122,9 @@ class FaultCases:
         b.command_time = b.time + DT - sign * near(b.robot.safety.command_age, outside)
         b.tick()
 
+    def object_age(self, b: Bench, j: int, outside: bool, sign: int):
+        b.tick(command={"object_time": b.time + DT - sign * near(b.robot.safety.object_age, outside)})
+
     def hold_time(self, b: Bench, j: int, outside: bool, sign: int):
         b.tick(command={"kp": {j: np.nan}})
         b.tick(near(b.robot.safety.hold_time, outside), command={"kp": {j: np.nan}})

@@ -250,6 +250,39 @@ def test_a_policy_of_nan_cannot_be_armed_away(bench):
     assert bench.arm() is None
 
 
+@pytest.mark.parametrize("never", [-math.inf, math.nan])
+def test_an_object_out_of_sight_holds_damps_and_cannot_be_armed_away(bench, never):
+    limit = bench.robot.safety.object_age
+    bench.armed()
+    lost = bench.time
+    while bench.safety.mode == Mode.RUN:
+        bench.tick(command={"object_time": lost})
+    assert bench.safety.mode == Mode.HOLD and limit < bench.time - lost <= limit + DT
+    while bench.safety.mode == Mode.HOLD:
+        bench.tick(command={"object_time": lost})
+    assert bench.time - lost <= limit + bench.robot.safety.hold_time + 2 * DT
+    assert bench.safety.fault.rule.name == "object_age"
+    for unseen in (lost, never):
+        bench.tick(command={"object_time": unseen})
+        assert "S2R-028 object_age: the object" in bench.arm()
+    bench.tick(command={"object_time": bench.time})
+    assert bench.arm() is None
+
+
+def test_an_object_that_comes_back_into_sight_in_time_ends_the_hold(bench):
+    bench.armed()
+    bench.tick(command={"object_time": bench.time - 1})
+    assert bench.safety.mode == Mode.HOLD
+    bench.tick(command={"object_time": bench.time})
+    assert (bench.safety.mode, bench.safety.fault) == (Mode.RUN, None)
+
+
+def test_a_command_that_rests_on_no_object_needs_none_in_sight(bench):
+    bench.tick(command={"object_time": math.inf})
+    assert bench.arm() is None
+    assert bench.safety.mode == Mode.RUN
+
+
 def test_another_fault_of_the_command_does_not_forbid_arming(bench):
     """Only what stopped the robot must be over: a pilot may fall silent while its robot lies on the floor."""
     bench.armed()
@@ -563,6 +596,7 @@ WOUNDS = {
     "command_finite": lambda b, since: {"command": NAN},
     "command_age_hold": lambda b, since: {"command": {"time": since}},
     "command_age": lambda b, since: {"command": {"time": since}},
+    "object_age": lambda b, since: {"command": {"object_time": since - b.robot.safety.object_age}},
     "hold_time": lambda b, since: {"command": NAN},
     "motor_enabled": lambda b, since: {"joint_enabled": {0: 0}},
     "tick_gap": lambda b, since: {"dt": 1.0},

@@ -44,7 +44,7 @@ def sized(changes: dict, record) -> dict:
 MODERATE = st.dictionaries(INDEX, st.floats(-0.2, 0.2), max_size=6)  # rad and rad/s that no rule minds
 TICK = st.tuples(
     wounds(STATE, ("imu_age", "time")),
-    wounds(dict.fromkeys(FIELDS, ANY), ("time",)),
+    wounds(dict.fromkeys(FIELDS, ANY), ("time", "object_time")),
     MODERATE,
     st.sampled_from([DT] * 8 + [0.0, -DT, 0.1, 1e-9]),
     st.sampled_from([None] * 8 + ["arm", "stop", "off"]),
