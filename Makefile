@@ -34,8 +34,8 @@ safety: $(VENV)/.all ## The safety gate: every branch of sim2real/safety covered
 	$(BIN)/coverage report --show-missing --fail-under=100
 	$(BIN)/python tools/mutate.py
 
-fuzz: $(VENV)/.all ## Every property test with fifty times the examples, and new ones each time
-	$(BIN)/python -m pytest -m hypothesis --hypothesis-profile=fuzz $(ARGS)
+fuzz: $(VENV)/.all ## Every property test with fifty times the examples, a million frames for each codec, and new ones each time
+	$(BIN)/python -m pytest -m hypothesis --hypothesis-profile=fuzz -o faulthandler_timeout=0 $(ARGS)
 
 bench: $(VENV)/.all ## One table: our figures beside the floor or the incumbent; fails on none
 	$(BIN)/python tools/bench.py $(ARGS)

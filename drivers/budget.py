@@ -8,12 +8,14 @@ counts as the first of the next five. Source: Bosch, "CAN Specification 2.0" (19
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from drivers.bus import BusError, BusSpec
+from drivers.canfd import fd_bits
 from drivers.codecs.mit import words_of
 from drivers.open import PROTOCOLS, load
 from drivers.wire import EXTENDED, REMOTE
@@ -70,6 +72,14 @@ def check(spec: BusSpec, rate: float) -> Budget:
             "move motors to another bus"
         )
     return b
+
+
+def bits_of(spec: BusSpec) -> Callable[[np.ndarray], np.ndarray]:
+    """What tells the length (n,) of frames on the bus of ``spec``, in bits of ``spec.bitrate``."""
+    if not spec.data_bitrate:
+        return frame_bits
+    ratio = spec.data_bitrate / spec.bitrate
+    return lambda frames: fd_bits(frames, ratio)
 
 
 # A standard frame with 8 bytes has 98 bits from the start to the end of the CRC: 7 chunks of 14. The state between two

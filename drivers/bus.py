@@ -47,8 +47,9 @@ class BusSpec:
     """One bus of a wiring.
 
     ``interface`` and ``channel`` are python-can's words for CAN (``socketcan``, ``can0``) and ``serial`` plus a device
-    for serial buses. ``bitrate`` in bit/s. ``watchdog``: seconds after which a motor without commands must stop by
-    itself; programmed and read back before torque. 0: it has none, and a person accepts that.
+    for serial buses. ``bitrate`` in bit/s; ``data_bitrate``: of the payloads on CAN-FD, 0 on classic CAN. ``watchdog``:
+    seconds after which a motor without commands must stop by itself; programmed and read back before torque. 0: it has
+    none, and a person accepts that.
     """
 
     name: str
@@ -58,6 +59,7 @@ class BusSpec:
     channel: str = ""
     bitrate: int = 1_000_000
     watchdog: float = 0.08
+    data_bitrate: int = 0
 
 
 @dataclass(frozen=True)

@@ -138,6 +138,7 @@ class CycloneWire:
             raise WireError(
                 f"{self._where}: {error.msg}\n  Is there such an interface, and is it up? (`ip link`)"
             ) from None
+        self._open = True
         self._topics: dict[str, Topic] = {}
         self._readers: dict[str, DataReader] = {}
         self._writers: dict[str, DataWriter] = {}
@@ -147,12 +148,14 @@ class CycloneWire:
             self._writer(topic)
 
     def write(self, topic: str, payload: bytes) -> None:
+        self._check()
         try:
             self._writer(topic).write(carrier(topic)(payload))
         except DDSException as error:
             raise WireError(f"{self._where}: {topic}: {error.msg}") from None
 
     def read(self, topic: str) -> list[bytes]:
+        self._check()
         try:
             samples = self._reader(topic).take(N=DEPTH)
         except DDSException as error:
@@ -161,6 +164,7 @@ class CycloneWire:
 
     def writers(self, topic: str) -> int:
         """Other participants' writers, this program's other wires included."""
+        self._check()
         alive = InstanceState.Alive
         return sum(
             bool(e.sample_info.instance_state & alive)
@@ -170,11 +174,18 @@ class CycloneWire:
         )
 
     def close(self) -> None:
+        if not self._open:
+            return
+        self._open = False
         # The binding frees an entity when nothing refers to it any more.
         self._readers.clear()
         self._writers.clear()
         self._topics.clear()
         del self._endpoints, self._participant
+
+    def _check(self) -> None:
+        if not self._open:
+            raise WireError(f"{self._where}: used after close; open the wire again")
 
     def _topic(self, name: str) -> Topic:
         if name not in self._topics:

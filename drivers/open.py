@@ -37,9 +37,19 @@ PROTOCOLS: dict[str, BusProtocol] = {
     "cubemars": _can("cubemars", "Cubemars", watchdog=False),
     "robstride_mit": _can("robstride_mit", "RobstrideMit", watchdog=False),
     "odrive": _can("odrive", "Odrive", watchdog=False),
-    "dynamixel": BusProtocol("serial", "drivers.serial_bus:SerialBus", "drivers.codecs.dynamixel:DynamixelCodec"),
+    "moteus": _can("moteus", "Moteus"),
+    "dynamixel": BusProtocol(
+        "serial",
+        "drivers.serial_bus:SerialBus",
+        "drivers.codecs.dynamixel:DynamixelCodec",
+        "drivers.sim.servo:SimServos",
+    ),
     "feetech": BusProtocol(
-        "serial", "drivers.serial_bus:SerialBus", "drivers.codecs.feetech:FeetechCodec", watchdog=False
+        "serial",
+        "drivers.serial_bus:SerialBus",
+        "drivers.codecs.feetech:FeetechCodec",
+        "drivers.sim.feetech:SimFeetech",
+        watchdog=False,
     ),
     "unitree_hg": BusProtocol(
         "dds", "drivers.dds_bus:DdsBus", "drivers.codecs.unitree_hg:UnitreeHgCodec", watchdog=False, calibrated=True
@@ -52,9 +62,19 @@ WORLDS: dict[str, str] = {
     "serial": "drivers.sim.serial_world:SerialWorld",
 }
 
-IMUS: dict[str, str] = {
-    "hipnuc": "drivers.codecs.hipnuc:Parser",
-    "unitree_hg": "drivers.codecs.unitree_hg:ImuParser",
+
+class ImuProtocol(NamedTuple):
+    """An IMU's protocol: what reads its packets, and the sensor's side for the twin ("module:Class")."""
+
+    parser: str
+    sensor: str = ""
+
+
+IMUS: dict[str, ImuProtocol] = {
+    "hipnuc": ImuProtocol("drivers.codecs.hipnuc:Parser", "drivers.codecs.hipnuc:Sensor"),
+    "witmotion": ImuProtocol("drivers.codecs.witmotion:Parser", "drivers.codecs.witmotion:Sensor"),
+    "bno085": ImuProtocol("drivers.codecs.bno085:Parser", "drivers.codecs.bno085:Sensor"),
+    "unitree_hg": ImuProtocol("drivers.codecs.unitree_hg:ImuParser"),
 }
 
 
@@ -87,7 +107,7 @@ def open_codec(spec: BusSpec) -> Any:
 def open_imu(spec: ImuSpec, wire: Any = None) -> Imu:
     """The IMU of ``spec``; on ``wire`` where given, else on the one that its interface names. Raises BusError."""
     _known("protocol", spec.protocol, IMUS, "imu")
-    parser = load(IMUS[spec.protocol])()
+    parser = load(IMUS[spec.protocol].parser)()
     return load("drivers.imu.serial:SerialImu")(spec, parser, open_wire(spec) if wire is None else wire)
 
 
@@ -126,11 +146,12 @@ def open_wire(spec: BusSpec | ImuSpec) -> Any:
 
 def _open_can(spec: BusSpec, where: str) -> Any:
     if spec.interface == "sim":
-        return _lasting(lambda: load("drivers.sim.socket_wire:SocketCanWire")(spec.channel))
+        return _lasting(lambda: load("drivers.sim.socket_wire:SocketCanWire")(spec.channel, spec.data_bitrate))
     if spec.interface == "socketcan":
-        return _lasting(lambda: load("drivers.can_wire:RawCanWire").open(spec.channel))
+        rates = spec.bitrate, spec.data_bitrate
+        return _lasting(lambda: load("drivers.can_wire:RawCanWire").open(spec.channel, *rates))
     _known("interface", spec.interface, ["sim", *load("drivers.can_wire:interfaces")()], where)
-    return load("drivers.can_wire:PythonCanWire")(spec.interface, spec.channel, spec.bitrate)
+    return load("drivers.can_wire:PythonCanWire")(spec.interface, spec.channel, spec.bitrate, spec.data_bitrate)
 
 
 def _lasting(make: Callable[[], Any]) -> Any:

@@ -1,7 +1,8 @@
 """Wires: the last thing before a syscall. A wire moves frames or bytes; it knows no protocol.
 
 A CAN frame is one row of a structured array with the memory layout of Linux's ``struct can_frame`` (linux/can.h),
-so that a whole tick of frames is one array, one ``bytes`` and one datagram.
+so that a whole tick of frames is one array, one ``bytes`` and one datagram. On a CAN-FD bus every frame is a row of
+``struct canfd_frame``, with the same names.
 """
 
 from __future__ import annotations
@@ -17,6 +18,11 @@ ERROR = 0x2000_0000  # bit 29: error frame (CAN_ERR_FLAG)
 FRAME = np.dtype(
     [("id", "<u4"), ("length", "u1"), ("pad", "u1", (3,)), ("data", "u1", (8,))]
 )  # 16 bytes, struct can_frame
+FD_FRAME = np.dtype(
+    [("id", "<u4"), ("length", "u1"), ("flags", "u1"), ("pad", "u1", (2,)), ("data", "u1", (64,))]
+)  # 72 bytes, struct canfd_frame
+BIT_RATE_SWITCH = 0x01  # of ``flags`` (CANFD_BRS): the payload travels at the data bit rate
+FD_LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])  # bytes, all that CAN-FD has
 
 
 class WireError(Exception):
@@ -32,14 +38,14 @@ class WireFull(WireError):
 
 
 class CanWire(Protocol):
-    """A classic CAN bus: whole ticks of frames in, whole ticks out."""
+    """A CAN bus: whole ticks of frames in, whole ticks out. Rows are FRAME, on a CAN-FD bus FD_FRAME."""
 
     def send(self, frames: np.ndarray) -> None:
-        """Queue ``frames`` (FRAME, shape (n,)) in order. Never blocks. Raises WireFull or WireError."""
+        """Queue ``frames`` (FRAME or FD_FRAME, shape (n,)) in order. Never blocks. Raises WireFull or WireError."""
         ...
 
     def recv(self) -> np.ndarray:
-        """All frames that arrived since the last call (FRAME, shape (n,), may be empty). Never blocks."""
+        """All frames that arrived since the last call (the same, shape (n,), may be empty). Never blocks."""
         ...
 
     def fileno(self) -> int:
@@ -89,4 +95,20 @@ def make_frames(ids: np.ndarray, data: np.ndarray, length: int = 8) -> np.ndarra
     frames["id"] = ids
     frames["length"] = length
     frames["data"] = data
+    return frames
+
+
+def frame_type(data_bitrate: int) -> np.dtype:
+    """The rows of a CAN wire: FD_FRAME where there is a data bit rate, else FRAME."""
+    return FD_FRAME if data_bitrate else FRAME
+
+
+def make_fd_frames(ids: np.ndarray, data: np.ndarray, length: int | np.ndarray) -> np.ndarray:
+    """CAN-FD frames with bit-rate switch from ``ids`` (n,) uint32 and ``data`` (n, k) uint8, k at most 64. ``length``: of
+    FD_LENGTHS."""
+    frames = np.zeros(len(ids), FD_FRAME)
+    frames["id"] = ids
+    frames["length"] = length
+    frames["flags"] = BIT_RATE_SWITCH
+    frames["data"][:, : data.shape[1]] = data
     return frames

@@ -105,6 +105,7 @@ class BusConfig(Strict):
     interface: str = "socketcan"
     channel: str = ""
     bitrate: Annotated[int, Field(gt=0)] = 1_000_000
+    data_bitrate: Annotated[int, Field(ge=0)] = 0  # bit/s of CAN-FD payloads; 0: classic CAN
     watchdog: Unsigned = 0.08  # s; 0: the device has none, and somebody accepts that
     motors: Annotated[list[MotorConfig], Field(min_length=1)]
 
@@ -132,7 +133,7 @@ class Wiring(Strict):
     def bus_specs(self) -> list[BusSpec]:
         return [
             BusSpec(b.name, b.protocol, tuple(MotorSpec(**m.model_dump()) for m in b.motors), b.interface, b.channel,
-                    b.bitrate, b.watchdog)
+                    b.bitrate, b.watchdog, b.data_bitrate)
             for b in self.buses
         ]  # fmt: skip
 

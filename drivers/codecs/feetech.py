@@ -71,15 +71,31 @@ REGISTERS: dict[str, tuple[int, int]] = {  # address, size
     "RESPONSE_LEVEL": (8, 1),
     "POSITION_MIN": (9, 2),
     "POSITION_MAX": (11, 2),
+    "TEMPERATURE_LIMIT": (13, 1),
+    "TORQUE_MAX": (16, 2),
+    "PHASE": (18, 1),
+    "UNLOADING": (19, 1),
+    "P_GAIN": (21, 1),
+    "D_GAIN": (22, 1),
     "HOMING_OFFSET": (31, 2),
     "MODE": (33, 1),
+    "PROTECTIVE_TORQUE": (34, 1),  # %
+    "PROTECTION_TIME": (35, 1),  # 10 ms
+    "OVERLOAD_TORQUE": (36, 1),  # %
     "TORQUE_ENABLE": (40, 1),
     "ACCELERATION": (41, 1),
     "GOAL_POSITION": (42, 2),
+    "GOAL_TIME": (44, 2),
+    "GOAL_VELOCITY": (46, 2),
     "TORQUE_LIMIT": (48, 2),
     "LOCK": (55, 1),
     "PRESENT_POSITION": (56, 2),
+    "PRESENT_VELOCITY": (58, 2),
+    "PRESENT_LOAD": (60, 2),
+    "PRESENT_VOLTAGE": (62, 1),
+    "PRESENT_TEMPERATURE": (63, 1),
     "STATUS": (65, 1),
+    "MOVING": (66, 1),
 }
 GOAL_AT, GOAL = (
     42,
@@ -126,11 +142,13 @@ def from_sign_magnitude(raw: np.ndarray, bit: int = 15) -> np.ndarray:
 
 
 class Packet(NamedTuple):
-    """A packet whose checksum is right. ``instruction``: of a servo its error byte."""
+    """A packet whose checksum is right. ``instruction``: of a servo its error byte. ``end``: how many bytes of the last
+    ``feed`` it took."""
 
     id: int
     instruction: int
     parameters: bytes
+    end: int = 0
 
 
 class Parser:
@@ -146,6 +164,7 @@ class Parser:
     def feed(self, data: bytes) -> list[Packet]:
         """Every packet completed by ``data``, oldest first."""
         buffer = self._bytes
+        old = len(buffer)
         buffer += data
         packets, at = [], 0
         while (start := buffer.find(HEADER, at)) >= 0:
@@ -162,7 +181,7 @@ class Parser:
                     break
                 body = bytes(buffer[at + 2 : end])
                 if checksum(body[:-1]) == body[-1]:
-                    packets.append(Packet(id, body[2], body[3:-1]))
+                    packets.append(Packet(id, body[2], body[3:-1], end - old))
                     at = end
                     continue
             self.rejected += 1
@@ -175,6 +194,19 @@ class Parser:
     def clear(self) -> None:
         """Forget what is not complete yet."""
         self._bytes.clear()
+
+
+def models_of(spec: BusSpec) -> list[Model]:
+    """The rows of MODELS of the motors of ``spec``. Raises BusError listing those that there are."""
+    for m in spec.motors:
+        if m.model not in MODELS:
+            close = difflib.get_close_matches(m.model, MODELS, n=1)
+            hint = f" (did you mean '{close[0]}'?)" if close else ""
+            raise BusError(
+                f"bus {spec.name}, motor of {m.joint} (id {m.id}): no Feetech model '{m.model}'{hint}; known: "
+                f"{', '.join(MODELS)}.\n  Add its row to MODELS in drivers/codecs/feetech.py"
+            )
+    return [MODELS[m.model] for m in spec.motors]
 
 
 class FeetechCodec:
@@ -191,14 +223,8 @@ class FeetechCodec:
     def __init__(self, spec: BusSpec) -> None:
         """Raises BusError for an unknown model, an id that cannot be, or a watchdog that the wiring counts on."""
         self._spec = spec
+        models = models_of(spec)
         for m in spec.motors:
-            if m.model not in MODELS:
-                close = difflib.get_close_matches(m.model, MODELS, n=1)
-                hint = f" (did you mean '{close[0]}'?)" if close else ""
-                raise BusError(
-                    f"bus {spec.name}, motor of {m.joint} (id {m.id}): no Feetech model '{m.model}'{hint}; known: "
-                    f"{', '.join(MODELS)}.\n  Add its row to MODELS in drivers/codecs/feetech.py"
-                )
             if not 0 <= m.id <= ID_MAX:
                 raise BusError(f"bus {spec.name}, motor of {m.joint}: got id {m.id}, expected 0 to {ID_MAX}")
         if len({m.id for m in spec.motors}) < len(spec.motors):
@@ -210,7 +236,6 @@ class FeetechCodec:
                 f"'watchdog: {NO_WATCHDOG:g}'"
             )
         n = len(spec.motors)
-        models = [MODELS[m.model] for m in spec.motors]
         self.rejected = 0
         self.ids = np.array([m.id for m in spec.motors], np.uint8)
         self._row_of = np.full(256, -1, np.intp)

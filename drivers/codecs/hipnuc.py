@@ -12,6 +12,7 @@ from __future__ import annotations
 import binascii
 import math
 import struct
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -125,3 +126,19 @@ class Parser:
             at = len(buffer) - (buffer[-1:] == HEAD[:1])  # nothing begins in the rest, but its last byte may
         del buffer[:at]
         return packets
+
+
+class Sensor:
+    """The sensor's side (a ``drivers.sim.imu.Sensor``)."""
+
+    RATE_MAX = 1000.0  # Hz
+
+    def pack(
+        self, time: float, orientation: Sequence[float], spin: Sequence[float], acceleration: Sequence[float]
+    ) -> bytes:
+        return pack(Hi91(time, 40.0, acceleration, spin, orientation, 0))
+
+    def retell(self, packet: bytes, change: Callable[[bytearray], None]) -> bytes:
+        payload = bytearray(packet[HEAD_SIZE:])
+        change(payload)
+        return frame(bytes(payload))

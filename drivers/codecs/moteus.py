@@ -1,20 +1,28 @@
-"""moteus controllers: the payloads of their register protocol, bytes to SI and back, both sides.
-
-Bytes only: a command is longer than the 8 bytes of classic CAN, and no wire of this package carries CAN-FD yet. So there is
-no line for moteus in ``drivers/open.py``.
+"""moteus controllers on CAN-FD (1 Mbit/s, payloads at 5 Mbit/s): bytes to SI and back, both sides.
 
     identifier = source << 8 | destination, bit 15: an answer is wanted; above 7FF the frame is an extended one
-    payload    = subframes [type | count, first register, values ...], filled up to a length of CAN-FD with 50
+    payload    = subframes (moteus_frame.py)
 
-Numbers are little-endian; positions are turns of the output shaft. The law runs in the controller:
+Positions are turns of the output shaft. The law runs in the controller:
 
     torque = kp kp_scale (position - p) + kd kd_scale (velocity - v) + feed-forward
 
-with kp and kd of its own configuration (servo.pid_position, N m/rev and N m s/rev), which only the diagnostic channel tells.
-Every command carries its own watchdog time. On expiry the controller goes to mode 11 (timeout), which brakes as servo.timeout_mode
-says (factory: zero velocity), and stays there until it is told to stop.
+where the position moves on with the velocity until the next command. kp and kd are of its own configuration, which connecting
+sets to the model's (full scale of the gains that a command can ask for, not a tuning) and reads back over its console, with
+no integral gain, its time-out, and damping as what a time-out does. These live in RAM: a controller that was without power
+has its flash's again, so save them there (``conf write`` in the maker's tview), or connect again.
 
-Source: mjbots/moteus, docs/reference.md (A.1 subframes, registers, scalings); the library moteus 1.1.1 packs the same bytes.
+Any command makes a stopped controller obey. So a motor is commanded only after ``pack_enable``, and only while it says that it
+obeys or is about to: one that left UNANSWERED_MAX commands without such an answer is only asked until it gives one, and one
+that obeyed and then says that it is stopped was reset, and is only asked until it is enabled again.
+
+Every command carries the watchdog's time. On expiry the controller goes to mode 11 (timeout), where it damps with its own kd,
+and stays there until it is told to stop.
+
+The maker's register reference says that kd_scale is limited to kp_scale. The firmware has no such limit (fw/pid.h scales the
+two by themselves, and its zero-velocity mode is kp_scale 0), which is what is relied on here: damping is kp 0.
+
+Source: mjbots/moteus, docs/protocol/can.md, registers.md, diagnostic.md, docs/reference/configuration.md.
 """
 
 from __future__ import annotations
@@ -24,16 +32,53 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drivers.bus import MotorCommand
+from drivers.bus import BusError, BusSpec, MotorCommand, MotorState
+from drivers.can_bus import RegisterAnswer, RegisterCheck
 from drivers.codecs.mit import QUANTITIES
+from drivers.codecs.moteus_frame import (
+    CONSOLE,
+    CONSOLE_MAX,
+    CONSOLE_READ,
+    CONSOLE_SAYS,
+    CONSOLE_WRITE,
+    NOP,
+    READ,
+    REPLY,
+    WRITE,
+    Register,
+    Resolution,
+    console,
+    pad,
+    serial_number,
+    subframes,
+    varuint,
+)
+from drivers.codecs.robstride import model_of
+from drivers.wire import ERROR, EXTENDED, REMOTE, make_fd_frames
 
 TURN = 2 * np.pi
+DATA_BITRATE = 5_000_000
 REPLY_WANTED = 0x8000
-NOP = 0x50
-LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)  # of a CAN-FD payload
-WRITE, READ, REPLY = 0x00, 0x10, 0x20  # type of a subframe; + 4 * Resolution, + count (0: a varuint follows)
-ERROR = 0x30
-VALUES = ("i1", "<i2", "<i4", "<f4")  # by resolution
+HOST = 0  # our source
+ID_MAX = 0x7E  # 7F is everybody
+UNANSWERED_MAX = 5  # commands; 20 ms at 250 Hz, and it takes 8 ms to get ready
+
+
+class Model(NamedTuple):
+    """Of a servo: turns of the output for one of the rotor; N m it peaks at; kp (N m/rev) and kd (N m s/rev) of its
+    configuration, which are the largest that a command can ask for."""
+
+    ratio: float
+    torque: float
+    kp: float
+    kd: float
+
+
+# qdd100 beta 2: 6:1 and 16 N m, blog.mjbots.com "qdd100 beta 2"; beta 1: 12.5 N m, there too.
+MODELS: dict[str, Model] = {
+    "qdd100-beta2": Model(1 / 6, 16.0, 400.0, 20.0),
+    "qdd100-beta1": Model(1 / 6, 12.5, 400.0, 20.0),
+}
 
 
 class Mode(IntEnum):
@@ -41,29 +86,17 @@ class Mode(IntEnum):
 
     STOPPED = 0
     FAULT = 1
+    ENABLING = 2
+    CALIBRATING = 3
+    CALIBRATED = 4
     POSITION = 10
     TIMEOUT = 11
     ZERO_VELOCITY = 12
     BRAKE = 15
 
 
-class Register(IntEnum):
-    """Registers that the codec reads or writes."""
-
-    MODE = 0x000
-    POSITION = 0x001  # rev
-    VELOCITY = 0x002  # rev/s
-    TORQUE = 0x003  # N m
-    TEMPERATURE = 0x00E  # deg C
-    FAULT = 0x00F
-    COMMAND_POSITION = 0x020
-    COMMAND_VELOCITY = 0x021
-    COMMAND_TORQUE = 0x022
-    COMMAND_KP_SCALE = 0x023
-    COMMAND_KD_SCALE = 0x024
-    COMMAND_MAX_TORQUE = 0x025
-    COMMAND_TIMEOUT = 0x027  # s
-
+READY = (Mode.ENABLING, Mode.CALIBRATING, Mode.CALIBRATED, Mode.POSITION)  # obeys, or is about to
+TIMED_OUT = 0x100  # as MotorState.error; below it: register 00F
 
 FAULTS: dict[int, str] = {
     32: "calibration fault",
@@ -79,13 +112,19 @@ FAULTS: dict[int, str] = {
     42: "theta invalid",
     43: "position invalid",
     44: "driver enable fault",
+    45: "stop position deprecated",
+    46: "timing violation",
+    47: "back-EMF feed-forward without acceleration limit",
+    48: "invalid limits",
+    TIMED_OUT: "time-out: no command in time",
 }
 
-# A command: mode, six floats from 020, the time-out, and the questions; 42 bytes and 6 NOP.
+# A command: mode, six floats from 020, the time-out, no limits on the way there, and the questions; 46 bytes and 2 NOP.
 COMMAND = np.dtype(
     [("mode", "u1", (3,)), ("target_head", "u1", (3,)), ("target", "<f4", (6,)), ("timeout_head", "u1", (2,)),
-     ("timeout", "<f4"), ("questions", "u1", (6,)), ("nop", "u1", (6,))]
+     ("timeout", "<f4"), ("limits", "i1", (4,)), ("questions", "u1", (6,)), ("nop", "u1", (2,))]
 )  # fmt: skip
+NO_LIMITS = (WRITE | 2, Register.COMMAND_VELOCITY_LIMIT, -1, -1)  # negative: none, whatever is configured
 QUESTIONS = (READ | 1, Register.MODE, READ | 0xC | 3, Register.POSITION, READ | 2, Register.TEMPERATURE)
 # Its answer: mode; position, velocity, torque; temperature, fault; 21 bytes and 3 NOP.
 ANSWER = np.dtype(
@@ -98,6 +137,10 @@ ANSWER_HEADS = {
     "state_head": (REPLY | 2, Register.TEMPERATURE),
 }
 STOP = bytes([WRITE | 1, Register.MODE, Mode.STOPPED, *QUESTIONS])  # 9 bytes: padded to 12
+SERIAL = "serial_number"  # no name of the configuration: registers 120 to 122
+ASK_SERIAL = bytes([READ | Resolution.INT32 << 2 | 3]) + varuint(Register.SERIAL_NUMBER)
+ASK_FIRMWARE = bytes([READ | Resolution.INT32 << 2 | 1]) + varuint(Register.FIRMWARE)
+HEARING = bytes([CONSOLE_READ, CONSOLE, CONSOLE_MAX])
 
 
 class Gains(NamedTuple):
@@ -119,17 +162,22 @@ class Answers(NamedTuple):
     fault: np.ndarray
 
 
+def gains_of(spec: BusSpec) -> Gains:
+    """Of the motors of ``spec``. Raises BusError for an unknown model."""
+    models = [model_of(m, MODELS, "moteus.py") for m in spec.motors]
+    return Gains(*(np.array([getattr(m, name) for m in models]) for name in Gains._fields))
+
+
 def identifier(source: int, destination: int, reply: bool = False) -> int:
-    """29 bits; above 7FF it needs an extended frame."""
-    return source << 8 | destination | REPLY_WANTED * reply
+    """16 bits, with EXTENDED where a standard frame cannot hold them."""
+    id = source << 8 | destination | REPLY_WANTED * reply
+    return id | EXTENDED if id > 0x7FF else id
 
 
-def pad(payload: bytes) -> bytes:
-    """``payload`` filled up to the next length of CAN-FD. Raises ValueError beyond 64 bytes."""
-    for length in LENGTHS:
-        if len(payload) <= length:
-            return payload.ljust(length, bytes([NOP]))
-    raise ValueError(f"payload: got {len(payload)} bytes, expected at most 64")
+def pack_question(id: int, payload: bytes) -> np.ndarray:
+    """FD_FRAME (1,) to controller ``id``, which answers."""
+    data = np.frombuffer(pad(payload), np.uint8)
+    return make_fd_frames(np.array([identifier(HOST, id, reply=True)], np.uint32), data[None], len(data))
 
 
 def pack_command(command: MotorCommand, gains: Gains, timeout: float) -> np.ndarray:
@@ -161,6 +209,7 @@ def pack_command(command: MotorCommand, gains: Gains, timeout: float) -> np.ndar
     )
     frames["timeout_head"] = WRITE | 0xC | 1, Register.COMMAND_TIMEOUT
     frames["timeout"] = timeout
+    frames["limits"] = NO_LIMITS
     frames["questions"] = QUESTIONS
     frames["nop"] = NOP
     return frames.view(np.uint8).reshape(len(frames), -1)
@@ -198,46 +247,201 @@ def unpack_answer(data: np.ndarray) -> tuple[Answers, np.ndarray]:
     return Answers(frames["mode"].astype(np.int64), position * TURN, velocity * TURN, torque, *state), sound
 
 
-def registers_of(payload: bytes) -> dict[int, float | int | None]:
-    """Every register that a payload writes, answers, or (None) asks for. Raises ValueError if it is not whole."""
-    found: dict[int, float | int | None] = {}
-    at = 0
+class MoteusCodec:
+    """Frames for the controllers of one bus, and what their answers say (a ``can_bus.CanCodec``)."""
 
-    def take(n: int) -> bytes:
-        nonlocal at
-        if at + n > len(payload):
-            raise ValueError(f"payload {payload.hex()}: ends at byte {len(payload)}, expected {n} more from byte {at}")
-        at += n
-        return payload[at - n : at]
+    # A command of 48 bytes and an answer of 24, in bits at 1 Mbit/s: random motion of a motor whose answers are extended
+    # frames (id above 7; else 22 bits less), and the most that stuffing can make of them (one for every four bits).
+    TICK_BITS = (244.0, 271.6)
+    IDENTITY = (SERIAL,)
+    TURN = 2 * np.pi / 6  # of the output, in one turn of the rotor, whose encoder is all that there is; of all MODELS
 
-    def varuint() -> int:
-        value = 0
-        for shift in range(0, 35, 7):
-            byte = take(1)[0]
-            value |= (byte & 0x7F) << shift
-            if byte < 0x80:
-                return value
-        raise ValueError(f"payload {payload.hex()}: a number of more than 5 bytes before byte {at}")
-
-    while at < len(payload):
-        head = take(1)[0]
-        if head == NOP:
-            continue
-        if head >= ERROR:
-            raise ValueError(
-                f"payload {payload.hex()}: got subframe {head:#x} at byte {at - 1}, expected one of registers"
+    def __init__(self, spec: BusSpec) -> None:
+        """Raises BusError for an unknown model, an id that cannot be, or a bus without CAN-FD."""
+        _check_ids(spec)
+        if spec.data_bitrate != DATA_BITRATE:
+            raise BusError(
+                f"bus {spec.name}: got data_bitrate {spec.data_bitrate}, expected {DATA_BITRATE}: moteus speaks CAN-FD.\n"
+                f"  Write 'data_bitrate: {DATA_BITRATE}' into the wiring, and use an adapter that can do it"
             )
-        count, resolution = head & 3 or varuint(), head >> 2 & 3
-        first = varuint()
-        for register in range(first, first + count):
-            kind = np.dtype(VALUES[resolution])
-            reads = head & 0x30 == READ
-            found[register] = None if reads else np.frombuffer(take(kind.itemsize), kind)[0].item()
-    return found
+        models = [model_of(m, MODELS, "moteus.py") for m in spec.motors]
+        n = len(models)
+        self._spec, self._gains, self._timeout = spec, gains_of(spec), spec.watchdog
+        ids = [m.id for m in spec.motors]
+        self._ids = np.array([identifier(HOST, id, reply=True) for id in ids], np.uint32)
+        self._silent_ids = np.array([identifier(HOST, id) for id in ids], np.uint32)
+        self._row_of = np.full(0x80, -1, np.intp)
+        self._row_of[ids] = np.arange(n)
+        self._wanted = np.zeros(n, bool)  # to obey
+        self._following = np.zeros(n, bool)  # has said, since it was enabled, that it obeys
+        self._unready = np.zeros(n, np.int64)  # commands sent since it last said that it is READY
+        self._asked: list[tuple[str, int]] = [("", 0)] * n  # on the console: what, and how often its answer was fetched
+        self._said = [b""] * n
+        full, none = np.ones(n), np.zeros(n)
+        tview = "set it in the maker's tview, and 'conf write'"
+        self.checks = [
+            RegisterCheck("motor_position.rotor_to_output_ratio", np.array([m.ratio for m in models]),
+                          f"another gear, or it is not calibrated: correct the model in the wiring, or {tview}"),
+            RegisterCheck("servo.pid_position.kp", self._gains.kp, "gains would be others than asked for", True),
+            RegisterCheck("servo.pid_position.kd", self._gains.kd, "gains would be others than asked for", True),
+            RegisterCheck("servo.pid_position.ki", none, "an integral gain is not in the law", True),
+            RegisterCheck("servo.default_timeout_s", full * spec.watchdog, "it would not stop in time by itself", True),
+            RegisterCheck("servo.timeout_mode", full * Mode.ZERO_VELOCITY, "it would not damp after a time-out", True),
+        ]  # fmt: skip
+
+    def _frames(self, payload: bytes) -> np.ndarray:
+        """The same to every motor, with an answer wanted (FD_FRAME, (n,))."""
+        data = np.frombuffer(pad(payload), np.uint8)
+        return make_fd_frames(self._ids, np.broadcast_to(data, (len(self._ids), len(data))), len(data))
+
+    def pack_command(self, command: MotorCommand) -> np.ndarray:
+        """A command to each motor that was enabled, a question to the others (FD_FRAME, (n,)). Raises ValueError for a value
+        not finite."""
+        data = pack_command(command, self._gains, self._timeout)
+        frames = make_fd_frames(self._ids, data, data.shape[1])
+        off = ~self._wanted | (self._unready >= UNANSWERED_MAX)
+        self._unready[~off] += 1
+        if off.any():
+            frames[off] = self._frames(bytes(QUESTIONS))[off]
+        return frames
+
+    def pack_enable(self, state: MotorState) -> np.ndarray:
+        """To each motor that does not obey: a stop where it is in an error, and position mode without gains or torque."""
+        off = np.flatnonzero(~state.enabled)
+        self._wanted[off], self._following[off], self._unready[off] = True, False, 0
+        stop = self._frames(STOP)[off[state.error[off] != 0]]
+        return np.concatenate([stop, self.pack_command(MotorCommand(*np.zeros((5, len(self._ids)))))[off]])
+
+    def pack_disable(self) -> np.ndarray:
+        self._wanted[:] = False
+        return self._frames(STOP)
+
+    def pack_poll(self, state: MotorState) -> np.ndarray:
+        return self._frames(bytes(QUESTIONS))
+
+    def pack_register(self, row: int, register: str, value: float | int | None = None) -> np.ndarray:
+        """Write a configuration value, or ask for it and fetch what the console has to say; or ask for SERIAL.
+
+        The console's answers do not tell what they answer, so that only one question is out at a time: it is put again
+        when its answer was fetched twice and did not come, and before that only fetched.
+        """
+        if value is not None:
+            return self._type(row, f"conf set {register} {value:.9g}\n")
+        if register == SERIAL:
+            return pack_question(self._spec.motors[row].id, ASK_SERIAL)
+        asked, fetched = self._asked[row]
+        fetch = make_fd_frames(self._ids[row : row + 1], np.frombuffer(HEARING, np.uint8)[None], len(HEARING))
+        if asked == register and fetched < 2:
+            self._asked[row] = register, fetched + 1
+            return fetch
+        self._asked[row], self._said[row] = (register, 1), b""
+        return np.concatenate([self._type(row, f"conf get {register}\n"), fetch])
+
+    def _type(self, row: int, text: str) -> np.ndarray:
+        payload = np.frombuffer(pad(console(CONSOLE_WRITE, text.encode())), np.uint8)
+        return make_fd_frames(self._silent_ids[row : row + 1], payload[None], len(payload))
+
+    def unpack_registers(self, frames: np.ndarray) -> list[RegisterAnswer]:
+        """What the consoles said of what was asked for, and serial numbers. OK confirms a write; ERR stands for a value
+        that there is not."""
+        answers = []
+        rows = self.owners(frames)
+        for frame, row in zip(frames[rows >= 0], rows[rows >= 0].tolist(), strict=True):
+            payload = frame["data"][: frame["length"]].tobytes()
+            if (serial := _serial_number(payload)) is not None:
+                answers.append(RegisterAnswer(row, SERIAL, serial, False))
+            for text in _console_texts(payload):
+                *lines, self._said[row] = (self._said[row] + text)[-1024:].split(b"\n")
+                for line in lines:
+                    register = self._asked[row][0]
+                    if register and (value := _number(line)) is not None:
+                        answers.append(RegisterAnswer(row, register, value, False))
+                        self._asked[row] = "", 0
+        return answers
+
+    def unpack(self, frames: np.ndarray, state: MotorState, now: float) -> int:
+        """Put answers into ``state``, the latest of each motor last. Returns how many frames came from nobody on this bus, or
+        were no whole answers."""
+        rows = self.owners(frames)
+        rows[frames["length"] != ANSWER.itemsize] = -1
+        answers, sound = unpack_answer(frames["data"][:, : ANSWER.itemsize])
+        good = (rows >= 0) & sound
+        mine, mode = rows[good], answers.mode[good]
+        state.position[mine], state.velocity[mine] = answers.position[good], answers.velocity[good]
+        state.torque[mine], state.temperature[mine] = answers.torque[good], answers.temperature[good]
+        state.enabled[mine] = mode == Mode.POSITION
+        fault = np.maximum(answers.fault[good], 1)
+        state.error[mine] = np.where(mode == Mode.FAULT, fault, np.where(mode == Mode.TIMEOUT, TIMED_OUT, 0))
+        state.time[mine] = now
+        latest = np.full(len(self._ids), -1)
+        latest[mine] = mode  # of several the last
+        self._unready[np.isin(latest, READY)] = 0
+        self._wanted &= ~self._following | (latest != Mode.STOPPED)
+        self._following |= latest == Mode.POSITION
+        return int(len(frames) - np.count_nonzero(good))
+
+    def owners(self, frames: np.ndarray) -> np.ndarray:
+        """Whose each of ``frames`` is: (m,) rows of the motors, -1 for nobody on this bus."""
+        ids = frames["id"].astype(np.int64)
+        bare = ids & ~EXTENDED
+        rows = self._row_of[bare >> 8 & 0x7F].copy()
+        rows[(bare > 0x7F00) | (bare & 0xFF != HOST) | (ids & (REMOTE | ERROR) != 0)] = -1
+        return rows
+
+    def error_name(self, code: int) -> str:
+        return fault_name(code)
 
 
 def fault_name(code: int) -> str:
-    """What register 00F means."""
+    """The maker's name of register 00F, or of TIMED_OUT."""
     if code in FAULTS or not code:
         return FAULTS.get(code, "none")
     return "limited" if 96 <= code <= 103 else f"unknown fault {code}"
+
+
+def _check_ids(spec: BusSpec) -> None:
+    for m in spec.motors:
+        where = f"bus {spec.name}, motor of {m.joint}"
+        if not 1 <= m.id <= ID_MAX:
+            raise BusError(f"{where}: got id {m.id:#x}, expected 0x1 to {ID_MAX:#x}")
+        if m.feedback_id:
+            raise BusError(
+                f"{where} (id {m.id:#x}): got feedback_id {m.feedback_id:#x}, expected none: it answers to who asked"
+            )
+
+
+def _serial_number(payload: bytes) -> int | None:
+    try:
+        return serial_number(payload)
+    except ValueError:
+        return None
+
+
+def _console_texts(payload: bytes) -> list[bytes]:
+    try:
+        return [s.text for s in subframes(payload) if s.type == CONSOLE_SAYS and s.first == CONSOLE]
+    except ValueError:
+        return []
+
+
+def _number(line: bytes) -> float | None:
+    """The value in a line of the console; NaN: there is no such thing; None: no answer to a question."""
+    if line.startswith(b"ERR"):
+        return float("nan")
+    try:
+        return float(line)
+    except ValueError:
+        return None
+
+
+class MoteusMotors:
+    """The motors' side: the frames that emulated controllers answer with."""
+
+    def __init__(self, spec: BusSpec) -> None:
+        self.ids = [m.id for m in spec.motors]
+        self.models = [model_of(m, MODELS, "moteus.py") for m in spec.motors]
+
+    def pack(self, row: int, destination: int, payload: bytes) -> np.ndarray:
+        """FD_FRAME (1,) with ``payload`` to who asked."""
+        data = np.frombuffer(pad(payload), np.uint8)
+        return make_fd_frames(np.array([identifier(self.ids[row], destination)], np.uint32), data[None], len(data))

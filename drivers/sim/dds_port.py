@@ -43,8 +43,6 @@ def split(data: bytes) -> Iterator[tuple[str, bytes]]:
 class DdsPort:
     """The robot's end, in the process of its World (a serve.Port)."""
 
-    bridge = None
-
     def __init__(self, world: DdsWorld, wire: SimDdsWire) -> None:
         self._world, self._wire = world, wire
 

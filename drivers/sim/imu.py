@@ -1,4 +1,4 @@
-"""The simulated IMU: HiPNUC packets at a fixed rate, byte by byte down a serial line.
+"""The simulated IMU: packets of its protocol at a fixed rate, byte by byte down a serial line.
 
 Samples are white noise and constant biases on the truth at a site of the plant; a packet becomes readable as its bytes
 arrive at the line's speed plus ``latency``. Not modelled: the sensor's own fusion filter (its lag and yaw drift),
@@ -13,18 +13,33 @@ import random
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from drivers.bus import BusError, ImuSpec
-from drivers.codecs import hipnuc
+from drivers.open import IMUS, load
 from drivers.sim.faults import IMU, Fault
 from drivers.wire import WireError
 
-PROTOCOL = "hipnuc"
 BITS_PER_BYTE = 10  # 8N1
 BLOCK = 256  # samples of noise drawn at once
-TEMPERATURE = 40  # deg C it reports
+
+
+class Sensor(Protocol):
+    """A sensor's side of its protocol."""
+
+    RATE_MAX: float  # Hz
+
+    def pack(
+        self, time: float, orientation: Sequence[float], spin: Sequence[float], acceleration: Sequence[float]
+    ) -> bytes:
+        """A sample as it is sent: s, (4,) w, x, y, z, (3,) rad/s and (3,) m/s^2 in the sensor's own frame."""
+        ...
+
+    def retell(self, packet: bytes, change: Callable[[bytearray], None]) -> bytes:
+        """``packet`` with ``change(payload)`` done to it, and a check that fits."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -42,8 +57,14 @@ class SimImu:
     """Samples ``body`` (a drivers.sim.plant.Plant) every 1/rate s."""
 
     def __init__(self, spec: ImuSpec, body, *, seed: int = 0, noise: ImuNoise | None = None, latency: float = 250e-6):
-        if spec.protocol != PROTOCOL:
-            raise BusError(f"IMU: no emulation of '{spec.protocol}', expected {PROTOCOL}")
+        known = [name for name, p in IMUS.items() if p.sensor]
+        if spec.protocol not in known:
+            raise BusError(f"IMU: no emulation of '{spec.protocol}', expected {', '.join(known)}")
+        self._sensor: Sensor = load(IMUS[spec.protocol].sensor)()
+        if spec.rate > (most := self._sensor.RATE_MAX):
+            raise BusError(
+                f"imu: got a rate of {spec.rate:g} Hz, expected at most {most:g}: '{spec.protocol}' has no more"
+            )
         self.spec, self.noise = spec, noise or ImuNoise()
         self._body, self._latency = body, latency
         self._byte_time = BITS_PER_BYTE / spec.baud
@@ -78,15 +99,11 @@ class SimImu:
             spin, acceleration = self._axes.T @ spin, self._axes.T @ acceleration
         w, x, y, z = multiply(orientation, (1.0, *noise[:3]))
         norm = math.sqrt(w * w + x * x + y * y + z * z)
-        packet = hipnuc.pack(
-            hipnuc.Hi91(
-                timestamp=now,
-                temperature=TEMPERATURE,
-                acceleration=[a + b for a, b in zip(acceleration.tolist(), noise[6:9], strict=True)],
-                angular_velocity=[a + b for a, b in zip(spin.tolist(), noise[3:6], strict=True)],
-                orientation=[w / norm, x / norm, y / norm, z / norm],
-                status=0,
-            )
+        packet = self._sensor.pack(
+            now,
+            [w / norm, x / norm, y / norm, z / norm],
+            [a + b for a, b in zip(spin.tolist(), noise[3:6], strict=True)],
+            [a + b for a, b in zip(acceleration.tolist(), noise[6:9], strict=True)],
         )
         self._send(packet, now)
 
@@ -111,15 +128,18 @@ class SimImu:
             self.carried.append(packet)
 
     def _lie(self, kind: str, packet: bytes) -> bytes:
-        payload = bytearray(packet[hipnuc.HEAD_SIZE :])
-        if kind == "garbage":
-            payload[1:] = self._random.randbytes(len(payload) - 1)
-            return hipnuc.frame(bytes(payload))
-        at = self._random.randrange(8, 8 * len(payload))
-        payload[at // 8] ^= 1 << at % 8
-        if kind == "wrong":
-            return hipnuc.frame(bytes(payload))
-        return packet[: hipnuc.HEAD_SIZE] + bytes(payload)  # corrupt: the CRC no longer fits
+        def change(payload: bytearray) -> None:
+            if kind == "garbage":
+                payload[1:] = self._random.randbytes(len(payload) - 1)
+            else:
+                at = self._random.randrange(8, 8 * len(payload))
+                payload[at // 8] ^= 1 << at % 8
+
+        if kind != "corrupt":
+            return self._sensor.retell(packet, change)
+        spoiled, at = bytearray(packet), self._random.randrange(64, 8 * len(packet))
+        spoiled[at // 8] ^= 1 << at % 8  # the check no longer fits
+        return bytes(spoiled)
 
     def inject(self, fault: Fault) -> None:
         self._faults.append(fault)

@@ -23,7 +23,7 @@ import numpy as np
 
 from drivers.bus import BusError, BusSpec, MotorCommand
 from drivers.sim.wire import priority
-from drivers.wire import FRAME
+from drivers.wire import frame_type
 
 # A plain two-node thermal model; its constants are of the right size for a motor of this class, not measured.
 AMBIENT = 25.0  # deg C
@@ -123,7 +123,8 @@ class SimMotors:
         self._rated = np.ones(n)  # N m
         self._rotor_limit = np.full(n, ROTOR_LIMIT)
         self._effect = np.zeros(n, np.int64)
-        self._last = np.zeros(n, FRAME)  # the last command of each
+        self.frame = frame_type(buses[0].data_bitrate)
+        self._last = np.zeros(n, self.frame)  # the last command of each
         self._commanded = np.zeros(n, bool)  # since it was enabled
         self._law = np.zeros((3, n))  # bias, kp, kd at the joints
         self._changed = False  # the law is no longer what commands and states make of it
@@ -192,7 +193,8 @@ class SimMotors:
         """The feedback of one motor."""
         if self._stale:
             self.refresh()
-        return row, self._keys[row], self._feedback[16 * row : 16 * row + 16], self._bits[row]
+        size = self.frame.itemsize
+        return row, self._keys[row], self._feedback[size * row : size * row + size], self._bits[row]
 
     def _say(self, row: int, frame: np.ndarray) -> Answer:
         """Any other answer (FRAME, (1,)) of one motor."""
@@ -201,10 +203,10 @@ class SimMotors:
     def refresh(self, raw: bytes = b"") -> list[int]:
         """Bits of the host's frames ``raw``, and, in the same pass, every motor's feedback of this substep."""
         if not self._stale:
-            return self._frame_bits(np.frombuffer(raw, FRAME)).tolist() if raw else []
+            return self._frame_bits(np.frombuffer(raw, self.frame)).tolist() if raw else []
         self._stale = False
         self._feedback = self._pack_feedback().tobytes()
-        bits = self._frame_bits(np.frombuffer(raw + self._feedback, FRAME)).tolist()
+        bits = self._frame_bits(np.frombuffer(raw + self._feedback, self.frame)).tolist()
         self._bits = bits[-len(self.specs) :]
         return bits[: -len(self.specs)]
 
@@ -238,7 +240,7 @@ class SimMotors:
             return
         rows, raws, times = map(list, zip(*self._arrived, strict=True))
         self._arrived.clear()
-        self._obey(rows, np.frombuffer(b"".join(raws), FRAME))
+        self._obey(rows, np.frombuffer(b"".join(raws), self.frame))
         self.last_command_time[rows] = times
         self._fed[rows] = times
         self._commanded[rows] = True

@@ -17,12 +17,12 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from heapq import heappop, heappush
+from typing import Any
 
 from drivers.bus import BusSpec
-from drivers.codecs.dynamixel_packet import BROADCAST, Packet, Parser, pack_status
 from drivers.serial_bus import BITS_PER_BYTE
 from drivers.sim.faults import HOST, POWER, Fault
-from drivers.sim.servo import SimServos
+from drivers.sim.servo_table import TableServos
 from drivers.wire import WireError, WireFull
 
 GAP = 20e-6  # s between two answers, besides the return delay
@@ -44,11 +44,11 @@ class Traffic:
 class SerialLine:
     """One line. ``carry(until)`` lets it work; ``write`` and ``read`` are the host's end (see SerialLineWire)."""
 
-    def __init__(self, spec: BusSpec, servos: SimServos, *, seed: int = 0, latency: float = 250e-6, gap: float = GAP):
+    def __init__(self, spec: BusSpec, servos: TableServos, *, seed: int = 0, latency: float = 250e-6, gap: float = GAP):
         self.spec, self.servos, self.traffic = spec, servos, Traffic()
         self._byte = BITS_PER_BYTE / spec.bitrate
         self._latency, self._gap = latency, gap
-        self._parser = Parser()
+        self._parser = servos.parser()
         self._sent: deque[tuple[float, bytearray]] = deque()  # by the host: (when its first byte starts, bytes)
         self._inbox: deque[list] = deque()  # [start, bytes, how many of them were read], in their order
         self._host_free = self._line_free = 0.0
@@ -122,7 +122,7 @@ class SerialLine:
             for packet in self._parser.feed(bytes(part)):
                 self._deliver(packet, start + packet.end * self._byte)
 
-    def _deliver(self, packet: Packet, time: float) -> None:
+    def _deliver(self, packet: Any, time: float) -> None:
         for fault in self._faults:
             if fault.motor == "*" and fault.kind in SPOILED and self._strikes(fault, time):
                 return
@@ -164,19 +164,18 @@ class SerialLine:
         return [(bytearray(answer), time)] * copies
 
     def _lie(self, kind: str, row: int, answer: bytes) -> bytes:
-        """An answer with another payload, and a CRC that fits."""
-        said = Parser().feed(answer)
-        if not said or said[0].id == BROADCAST:
-            return answer
-        payload = bytearray(said[0].parameters)
-        if kind == "garbage":
-            payload[1:] = self._random.randbytes(len(payload) - 1)
-        elif kind == "stuck":
-            payload = bytearray(self._stuck.setdefault((row, len(payload)), bytes(payload)))
-        elif len(payload) > 1:
-            at = self._random.randrange(8, 8 * len(payload))
-            payload[at // 8] ^= 1 << at % 8
-        return pack_status(said[0].id, payload[0], bytes(payload[1:]))
+        """An answer with another payload, and a check that fits."""
+
+        def change(payload: bytearray) -> None:
+            if kind == "garbage":
+                payload[1:] = self._random.randbytes(len(payload) - 1)
+            elif kind == "stuck":
+                payload[:] = self._stuck.setdefault((row, len(payload)), bytes(payload))
+            elif len(payload) > 1:
+                at = self._random.randrange(8, 8 * len(payload))
+                payload[at // 8] ^= 1 << at % 8
+
+        return self.servos.retell(answer, change)
 
     def _collide(self, start: float, part: bytearray) -> None:
         """Garble what the host sends while a servo speaks, and what that says."""

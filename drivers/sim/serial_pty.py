@@ -1,7 +1,8 @@
-"""Emulated Dynamixel servos on a pseudo-terminal, in real time, for programs that expect a serial port.
+"""Emulated Dynamixel or Feetech servos on a pseudo-terminal, in real time, for programs that expect a serial port.
 
     python -m drivers.sim.serial_pty --model XM430-W350 --count 20 --baud 4000000
     -> /dev/pts/7        open that with dynamixel-sdk, DYNAMIXEL Wizard, or a wiring's ``channel``
+    python -m drivers.sim.serial_pty --model STS3215-12V --count 6 --baud 1000000         for Feetech's SDK, lerobot, ...
 
 Ids count from 1. Each servo turns a wheel of its own (Wheels), free of gravity. A pseudo-terminal has no speed: answers
 leave when the simulated line would have carried them, ``--instant`` at once.
@@ -17,13 +18,15 @@ import time
 import tty
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from drivers.bus import BusError, BusSpec, MotorSpec
+from drivers.codecs import dynamixel, feetech
+from drivers.open import PROTOCOLS, load
 from drivers.sim.faults import parse_fault
 from drivers.sim.serial_line import SerialLine
-from drivers.sim.servo import SimServos
 
 TIMESTEP = 0.002  # s
 READ_SIZE = 65536
@@ -101,7 +104,7 @@ def serve_servos(spec: BusSpec, *, instant: bool = False, fast: bool = True, fau
     """A server of the servos of ``spec``. ``instant``: no time on the line. Raises BusError for an unknown model or
     fault."""
     body = Wheels(len(spec.motors))
-    servos = SimServos(spec, body, fast=fast)
+    servos = load(PROTOCOLS[spec.protocol].motors)(spec, body, fast=fast)
     slow = SerialLine(spec, servos, latency=0.0)
     line = SerialLine(replace(spec, bitrate=INSTANT), servos, latency=0.0, gap=0.0) if instant else slow
     for fault in faults:
@@ -112,8 +115,12 @@ def serve_servos(spec: BusSpec, *, instant: bool = False, fast: bool = True, fau
 def bus_of(model: str, count: int, baud: int = 4_000_000, **changes) -> BusSpec:
     """A bus of ``count`` servos with the ids 1, 2, ... and joints of these names."""
     motors = tuple(MotorSpec(f"servo_{i}", model, i) for i in range(1, count + 1))
-    return BusSpec(**{"name": "servos", "protocol": "dynamixel", "motors": motors, "interface": "serial",
-                      "bitrate": baud} | changes)  # fmt: skip
+    own: dict[str, Any] = {"protocol": "dynamixel"}
+    if model in feetech.MODELS:
+        own = {"protocol": "feetech", "watchdog": feetech.NO_WATCHDOG}
+    elif model not in dynamixel.MODELS:
+        raise BusError(f"no model '{model}', expected one of {', '.join([*dynamixel.MODELS, *feetech.MODELS])}")
+    return BusSpec(**{"name": "servos", "motors": motors, "interface": "serial", "bitrate": baud} | own | changes)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -12,12 +12,13 @@ from dataclasses import asdict
 import numpy as np
 
 from drivers.bus import BusError, BusSpec, ImuSpec
+from drivers.open import PROTOCOLS, load
 from drivers.sim.faults import Fault
 from drivers.sim.imu import ImuNoise
 from drivers.sim.motor import MotorEvent
 from drivers.sim.plant import Plant
 from drivers.sim.serial_line import GAP, SerialLine, SerialLineWire
-from drivers.sim.servo import SimServos
+from drivers.sim.servo_table import TableServos
 from drivers.sim.world import World
 from drivers.wire import WireError
 
@@ -26,9 +27,10 @@ class SerialWorld(World):
     """A robot in MuJoCo behind simulated serial lines. Arguments as for World."""
 
     def _check(self, buses: Sequence[BusSpec]) -> None:
-        if strangers := sorted({b.protocol for b in buses} - {"dynamixel"}):
+        known = [name for name, p in PROTOCOLS.items() if p.wire == "serial" and p.motors]
+        if strangers := sorted({b.protocol for b in buses} - set(known)):
             raise BusError(
-                f"no emulated servos for {', '.join(strangers)} on a serial line; expected dynamixel on every bus"
+                f"no emulated servos for {', '.join(strangers)} on a serial line; expected {' or '.join(known)} on every bus"
             )
 
     def _wire(
@@ -94,13 +96,14 @@ class AllServos:
         if unknown := sorted(set(registers) - set(self.joints)):
             raise BusError(f"registers: got joints {unknown}, expected some of {', '.join(self.joints)}")
         self.log: list[MotorEvent] = []
-        self.buses: list[SimServos] = []
+        self.buses: list[TableServos] = []
         shared = np.zeros((4, len(self.joints)))
         first = 0
         for spec in buses:
             own = {m.joint: registers[m.joint] for m in spec.motors if m.joint in registers}
             part = BodyPart(body, slice(first, first + len(spec.motors)), shared)
-            self.buses.append(SimServos(spec, part, registers=own, fast=fast, patient=patient, log=self.log))
+            servos = load(PROTOCOLS[spec.protocol].motors)
+            self.buses.append(servos(spec, part, registers=own, fast=fast, patient=patient, log=self.log))
             first += len(spec.motors)
 
     def act(self, start: float, end: float) -> None:
@@ -147,8 +150,6 @@ class BodyPart:
 
 class SerialPort:
     """A line as ``serve.Server`` offers it to other processes (a serve.Port): bytes either way."""
-
-    bridge = None
 
     def __init__(self, line: SerialLine):
         self._line = line

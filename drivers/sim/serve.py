@@ -10,7 +10,8 @@ word would be a lie. Frames are stamped when they are read, answers leave at the
 
     python -m drivers.sim.serve DIRECTORY [--can BUS=INTERFACE:CHANNEL ...] < spec.json
 
-The second form also puts a bus onto any python-can interface, so that other programs can drive these motors.
+The second form also puts a bus onto any python-can interface, so that other programs can drive these motors (bridge.py;
+``sim2real sim --serve`` does it for a whole robot).
 """
 
 from __future__ import annotations
@@ -34,10 +35,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from drivers.bus import BusError, BusSpec, ImuSpec, MotorSpec
+from drivers.sim.bridge import Bridge, can_bridge
 from drivers.sim.socket_wire import BUS_OFF, CONTROLLER, DATAGRAM, RESTARTED, TX_OVERFLOW
 from drivers.sim.wire import SimCan
 from drivers.sim.world import World
-from drivers.wire import ERROR, FRAME, CanWire, WireError, WireFull
+from drivers.wire import ERROR, FRAME, WireError, WireFull
 
 LAG_MAX = 0.05  # s of lag that is still caught up
 WAKE = 0.0005  # s between wake-ups while frames are on their way
@@ -64,8 +66,6 @@ class Pace:
 class Port(Protocol):
     """What hosts on one socket are connected to."""
 
-    bridge: CanWire | None
-
     def hear(self, data: bytes, now: float) -> bytes:
         """A datagram from a host; what to answer to it alone."""
         ...
@@ -76,15 +76,16 @@ class Port(Protocol):
 
 
 class BusPort:
-    """A bus with the hosts on it: sockets that come and go, and possibly a python-can wire."""
+    """A bus with the hosts on it, that come and go."""
 
-    def __init__(self, bus: SimCan, bridge: CanWire | None = None):
-        self.bus, self.bridge = bus, bridge
+    def __init__(self, bus: SimCan):
+        self.bus = bus
         self._away = False
 
     def hear(self, data: bytes, now: float) -> bytes:
-        """Rows of FRAME; anything else is dropped."""
-        if len(data) % FRAME.itemsize or (error := self.take(np.frombuffer(data, FRAME), now)) is None:
+        """Rows of the bus's frames; anything else is dropped."""
+        frame = self.bus.frame
+        if len(data) % frame.itemsize or (error := self.take(np.frombuffer(data, frame), now)) is None:
             return b""
         return error.tobytes()
 
@@ -93,11 +94,11 @@ class BusPort:
         try:
             self.bus.send(frames, now)
         except WireFull:
-            return error_frame(CONTROLLER, TX_OVERFLOW)
+            return error_frame(CONTROLLER, TX_OVERFLOW, self.bus.frame)
         except WireError:
             if not self._away:
                 self._away = True
-                return error_frame(BUS_OFF)
+                return error_frame(BUS_OFF, frame=self.bus.frame)
         return None
 
     def give(self, now: float) -> bytes:
@@ -106,31 +107,31 @@ class BusPort:
         away = self.bus.away(now)
         if away != self._away:
             self._away = away
-            raw += error_frame(BUS_OFF if away else RESTARTED).tobytes()
+            raw += error_frame(BUS_OFF if away else RESTARTED, frame=self.bus.frame).tobytes()
         return raw
 
 
-def error_frame(kind: int, reason: int = 0) -> np.ndarray:
-    """One FRAME (1,) as linux/can/error.h has it."""
-    frame = np.zeros(1, FRAME)
-    frame["id"], frame["length"] = ERROR | kind, 8
-    frame["data"][0, 1] = reason
-    return frame
+def error_frame(kind: int, reason: int = 0, frame: np.dtype = FRAME) -> np.ndarray:
+    """One ``frame`` (1,) as linux/can/error.h has it."""
+    made = np.zeros(1, frame)
+    made["id"], made["length"] = ERROR | kind, 8
+    made["data"][0, 1] = reason
+    return made
 
 
 class Server:
-    """Sockets for ``world`` in ``directory``; ``run`` serves them. ``bridges``: further hosts, by bus."""
+    """Sockets for ``world`` in ``directory``; ``run`` serves them. ``bridges``: further hosts, by port."""
 
     def __init__(
         self,
         world: World,
         directory: Path,
-        bridges: Mapping[str, CanWire] | None = None,
+        bridges: Mapping[str, Bridge] | None = None,
         warn: Callable[[str], object] = lambda text: print(text, file=sys.stderr),
     ):
         self.world, self.pace, self._warn = world, Pace(), warn
-        bridges = bridges or {}
-        self._ports: dict[str, Port] = {b.spec.name: BusPort(b, bridges.get(b.spec.name)) for b in world.buses}
+        self._bridges = dict(bridges or {})
+        self._ports: dict[str, Port] = {b.spec.name: BusPort(b) for b in world.buses}
         self._ports |= world.ports
         self._listeners: dict[socket.socket, str] = {}
         self._clients: dict[socket.socket, str] = {}
@@ -185,20 +186,24 @@ class Server:
     def _wait(self) -> None:
         """Until somebody has something to say, or the next substep is due, or frames may have arrived."""
         due = self.world.next_substep
-        if self.world.busy or any(p.bridge for p in self._ports.values()):
+        waited_on = {b: name for name, b in self._bridges.items() if b.fileno() >= 0}
+        if self.world.busy or len(waited_on) < len(self._bridges):
             due = min(due, self.world.time + WAKE)
         timeout = max(0.0, self.pace.epoch + due - time.monotonic())
-        ready, _, _ = select.select([*self._listeners, *self._clients], [], [], timeout)
+        ready: list[Any]
+        ready, _, _ = select.select([*self._listeners, *self._clients, *waited_on], [], [], timeout)
         for sock in ready:
-            if sock in self._listeners:
+            if sock in waited_on:
+                pass  # heard below
+            elif sock in self._listeners:
                 client, _ = sock.accept()
                 client.setblocking(False)
                 self._clients[client] = self._listeners[sock]
             else:
                 self._hear(sock)
-        for port in self._ports.values():
-            if port.bridge is not None and len(frames := port.bridge.recv()):
-                port.hear(frames.tobytes(), self._now())
+        for name, bridge in self._bridges.items():
+            if (data := bridge.hear()) and name in self._ports:
+                self._ports[name].hear(data, self._now())
 
     def _follow(self, real: float, began: float) -> None:
         """Move the world on to real time, as far as it can follow."""
@@ -242,10 +247,10 @@ class Server:
         out = {"imu": self.world.imu.read(now)}
         for name, port in self._ports.items():
             out[name] = port.give(now)
-            if port.bridge is not None and out[name]:
-                frames = np.frombuffer(out[name], FRAME)
+        for name, bridge in self._bridges.items():
+            if data := out.get(name):
                 try:
-                    port.bridge.send(frames[frames["id"] & ERROR == 0])
+                    bridge.say(data)
                 except WireFull:
                     self.pace.unread += 1
         for sock, name in list(self._clients.items()):
@@ -278,9 +283,8 @@ class Server:
             sock.close()
         self._clients.clear()
         self._listeners.clear()
-        for port in self._ports.values():
-            if port.bridge is not None:
-                port.bridge.close()
+        for bridge in self._bridges.values():
+            bridge.close()
 
 
 def world_of(spec: Mapping[str, Any]) -> World:
@@ -306,28 +310,26 @@ def serve(
     ready: Callable[[], object] = lambda: None,
     goes_on: Callable[[], bool] = lambda: True,
     warn: Callable[[str], object] = lambda text: print(text, file=sys.stderr),
-    can: Mapping[str, str] | None = None,
+    bridges: Mapping[str, Bridge] | None = None,
 ) -> Pace:
     """Serve ``world`` in ``directory`` while ``goes_on()``, or until a ``stop`` over its socket.
 
-    ``ready`` is called once, when every socket listens; ``warn`` when the machine is too slow. ``can``: buses to put on
-    python-can as well, {bus: "interface:channel"}. Returns how real the time was. Raises BusError, WireError.
+    ``ready`` is called once, when every socket listens; ``warn`` when the machine is too slow. ``bridges``: by bus, or
+    ``imu``, for other programs (bridge.py); closed at the end. Returns how real the time was. Raises BusError, WireError.
     """
-    bridges = {bus: _bridge(world, bus, channel) for bus, channel in (can or {}).items()}
     server = Server(world, Path(directory), bridges, warn)
     ready()
     server.run(goes_on)
     return server.pace
 
 
-def _bridge(world: World, bus: str, channel: str) -> CanWire:
-    from drivers.can_wire import PythonCanWire
-
-    if bus not in world.wires:
-        raise BusError(f"--can: got bus '{bus}', expected one of {', '.join(world.wires)}")
-    interface, _, name = channel.partition(":")
-    bitrate = next(b.spec.bitrate for b in world.buses if b.spec.name == bus)
-    return PythonCanWire(interface, name, bitrate)
+def _bridge(world: World, asked: str) -> tuple[str, Bridge]:
+    """Of ``BUS=INTERFACE:CHANNEL``."""
+    name, _, place = asked.partition("=")
+    spec = next((b.spec for b in world.buses if b.spec.name == name), None)
+    if spec is None:
+        raise BusError(f"--can: got bus '{name}', expected one of {', '.join(world.wires)}")
+    return name, can_bridge(spec, place)
 
 
 def _plain(value: Any) -> Any:
@@ -355,12 +357,13 @@ def main(argv: list[str] | None = None) -> int:
     for signum in (signal.SIGTERM, signal.SIGINT):
         signal.signal(signum, lambda number, _: signals.append(number))
     try:
+        world = world_of(json.load(sys.stdin))
         pace = serve(
-            world_of(json.load(sys.stdin)),
+            world,
             arguments.directory,
             ready=lambda: print("ready", flush=True),
             goes_on=lambda: not signals and os.getppid() == parent,
-            can=dict(c.split("=", 1) for c in arguments.can),
+            bridges=dict(_bridge(world, asked) for asked in arguments.can),
         )
     except (BusError, WireError) as error:
         print(error, file=sys.stderr)

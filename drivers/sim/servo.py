@@ -1,10 +1,8 @@
 """Emulated Dynamixel servos: what is behind the connector, decoded with the same codec as the host's side.
 
-All servos of a bus are rows of one control table. Each is a state machine: EEPROM that is locked while torque is on,
-indirect registers, operating modes, a bus watchdog that any instruction feeds, hardware errors with their shutdown and
-reboot, a count of turns that does not survive power. Its control law runs inside the plant's integrator, in every
-substep, from the moment a goal arrived on (within a substep the law is the time-weighted mean of old and new); answers
-tell the state at the start of the substep in which the servo was asked.
+Each is a state machine over its control table (servo_table.py): EEPROM that is locked while torque is on, indirect
+registers, operating modes, a bus watchdog that any instruction feeds, hardware errors with their shutdown and reboot, a
+count of turns that does not survive power.
 
 The law is that of the codec's docstring: duty cycle from the position error by the P gain, torque from duty cycle and
 back-EMF at nominal voltage. Not modelled: D, I and feed-forward gains, profiles, the current loop's bandwidth, cogging,
@@ -33,15 +31,15 @@ from drivers.codecs.dynamixel import (
     Register,
     StatusError,
 )
-from drivers.codecs.dynamixel_packet import BROADCAST, HEADER, Instruction, Packet, crc16, pack_status
-from drivers.sim.motor import AMBIENT, RATED_SHARE, ROTOR_RISE, ROTOR_TIME, THERMAL_PERIOD, Body, MotorEvent
+from drivers.codecs.dynamixel_packet import BROADCAST, HEADER, Instruction, Packet, Parser, crc16, pack_status
+from drivers.sim.motor import Body, MotorEvent
+from drivers.sim.servo_table import Answer, TableServos, to_bytes
 
 TABLE_SIZE = 256
 GOALS = range(100, 120)  # read-only once the watchdog has tripped
 WATCHDOG = REGISTERS["BUS_WATCHDOG"].address
 VOLTAGE = 120  # 0.1 V
 OVERHEATING = 0x04
-BOOT_TIME = 0.3  # s
 CLEAR_TURNS = bytes([0x01, 0x44, 0x58, 0x4C, 0x22])  # parameters of CLEAR: the count of turns
 VELOCITY_STIFFNESS = 10.0  # times the back-EMF, in velocity mode
 
@@ -49,13 +47,15 @@ CURRENT_MODE, VELOCITY_MODE, POSITION_MODE, EXTENDED_MODE, CURRENT_POSITION_MODE
 DRIVEN_BY = {CURRENT_MODE: "GOAL_CURRENT", VELOCITY_MODE: "GOAL_VELOCITY", PWM_MODE: "GOAL_PWM"}  # 0 at torque-on
 
 
-class SimServos:
+class SimServos(TableServos):
     """The servos of one bus, on the joints of ``body`` (which has the same order).
 
     ``registers``: by joint, what differs from the factory. Id, bit rate and model are the wiring's, and the return delay
     is 0, as ``sim2real setup`` would leave it. ``fast``: the firmware knows fast reads. ``patient``: a servo whose
     predecessor in a group read stays silent answers all the same; else it never does.
     """
+
+    BAUD_RATES = dynamixel.BAUD_RATES
 
     def __init__(
         self,
@@ -67,23 +67,15 @@ class SimServos:
         patient: bool = False,
         log: list[MotorEvent] | None = None,
     ):
-        self.spec = spec
-        self.joints = [m.joint for m in spec.motors]
-        self.log = [] if log is None else log
-        self._body, self.fast, self._patient = body, fast, patient
         models = dynamixel.models_of(spec)
+        super().__init__(spec, body, np.array([m.stall_torque for m in models]), TABLE_SIZE, log)
         n = len(models)
-        self._sign = np.array([m.sign for m in spec.motors], float)
-        self._offset = np.array([m.offset for m in spec.motors])
-        self._stall = np.array([m.stall_torque for m in models])
+        self.fast, self._patient = fast, patient
         self._damping = np.array([dynamixel.damping_of(m) for m in models])
         self._unit = np.array([dynamixel.torque_scale(m) for m in models])
         self._gain = np.array([dynamixel.gain_scale(m) for m in models])
-        self._bitrate = spec.bitrate  # at which the host talks now
-        self._table = np.zeros((n, TABLE_SIZE), np.uint8)
-        baud = {rate: code for code, rate in dynamixel.BAUD_RATES.items()}.get(spec.bitrate, 1)
         for row, (motor, model) in enumerate(zip(spec.motors, models, strict=True)):
-            own = {"MODEL": model.number, "ID": motor.id, "BAUD": baud, "RETURN_DELAY": 0}
+            own = {"MODEL": model.number, "ID": motor.id, "BAUD": self._baud(1), "RETURN_DELAY": 0}
             for name, register in REGISTERS.items():
                 self._set(row, name, own.get(name, register.default))
         for joint, changes in (registers or {}).items():
@@ -92,29 +84,26 @@ class SimServos:
             for name, value in changes.items():
                 self._set(self.joints.index(joint), name, value)
         self._factory = self._table.copy()
-        self.powered = [True] * n
-        self._readdress()
-        self.temperature = np.full(n, AMBIENT)
-        self.last_command_time = np.full(n, -np.inf)  # s, when a goal was last written
         self._turns = np.zeros(n)  # ticks that the count is off the shaft's
         self._fed = -np.inf  # s, when an instruction packet last ended
-        self._booting = np.full(n, -np.inf)  # s, until when
-        self._thermal_due = THERMAL_PERIOD
-        self._law = np.zeros((3, n))  # bias, kp, kd at the joints
-        self._since = np.full(n, -np.inf)  # s, when what makes the law last changed
-        self._changed = True  # the law is no longer what goals and modes make of it
-        self._settle = False  # the body still has the mean of two laws
-        self._stale = True
-        self._registered: dict[int, tuple[int, bytes]] = {}  # by row, what ACTION will write
-        self._body.limit(self._stall)
+        self._readdress()
         for row in range(n):
             self._lose_turns(row)
 
     # -- packets -----------------------------------------------------------------------------------------------------
 
-    def receive(self, packet: Packet, time: float) -> list[tuple[int, float, bytes]]:
-        """An instruction that ended at ``time``: the answers (row, delay behind the one before in s, bytes), in their
-        order on the line."""
+    def parser(self) -> Parser:
+        return Parser()
+
+    def retell(self, answer: bytes, change: Callable[[bytearray], None]) -> bytes:
+        said = Parser().feed(answer)
+        if not said or said[0].id == BROADCAST:  # of all servos at once
+            return answer
+        payload = bytearray(said[0].parameters)
+        change(payload)
+        return pack_status(said[0].id, payload[0], bytes(payload[1:]))
+
+    def receive(self, packet: Packet, time: float) -> list[Answer]:
         if packet.instruction == Instruction.STATUS:
             return []
         self._fed = time
@@ -126,11 +115,11 @@ class SimServos:
             answers = list(act(self, packet, time))
         return [answer for answer in answers if answer is not None]
 
-    def _ping(self, packet: Packet, time: float) -> Iterator[tuple[int, float, bytes] | None]:
+    def _ping(self, packet: Packet, time: float) -> Iterator[Answer | None]:
         for row in self._addressed(packet.id, time):
             yield self._answer(row, 0, bytes(self._table[row, [0, 1, 6]]), level=0)
 
-    def _read_one(self, packet: Packet, time: float) -> Iterator[tuple[int, float, bytes] | None]:
+    def _read_one(self, packet: Packet, time: float) -> Iterator[Answer | None]:
         if len(packet.parameters) != 4:
             yield from self._refuse(packet, time, StatusError.DATA_LENGTH)
             return
@@ -140,7 +129,7 @@ class SimServos:
                 data = self._read([row], address, size)
                 yield self._answer(row, StatusError.DATA_RANGE if data is None else 0, b"" if data is None else data[0])
 
-    def _write_one(self, packet: Packet, time: float) -> Iterator[tuple[int, float, bytes] | None]:
+    def _write_one(self, packet: Packet, time: float) -> Iterator[Answer | None]:
         if len(packet.parameters) < 3:
             yield from self._refuse(packet, time, StatusError.DATA_LENGTH)
             return
@@ -154,7 +143,7 @@ class SimServos:
             if packet.id != BROADCAST:
                 yield self._answer(row, error, level=2)
 
-    def _action(self, packet: Packet, time: float) -> Iterator[tuple[int, float, bytes] | None]:
+    def _action(self, packet: Packet, time: float) -> Iterator[Answer | None]:
         for row in self._addressed(packet.id, time):
             error = StatusError.RESULT_FAIL
             if row in self._registered:
@@ -162,13 +151,13 @@ class SimServos:
             if packet.id != BROADCAST:
                 yield self._answer(row, error, level=2)
 
-    def _reboot(self, packet: Packet, time: float) -> Iterator[tuple[int, float, bytes] | None]:
+    def _reboot(self, packet: Packet, time: float) -> Iterator[Answer | None]:
         for row in self._addressed(packet.id, time):
             if packet.id != BROADCAST:
                 yield self._answer(row, 0, level=2)
             self._restart(row, time, "rebooted")
 
-    def _clear(self, packet: Packet, time: float) -> Iterator[tuple[int, float, bytes] | None]:
+    def _clear(self, packet: Packet, time: float) -> Iterator[Answer | None]:
         for row in self._addressed(packet.id, time):
             done = packet.parameters == CLEAR_TURNS and not self._get(row, "TORQUE_ENABLE")
             if done:
@@ -176,7 +165,7 @@ class SimServos:
             if packet.id != BROADCAST:
                 yield self._answer(row, StatusError.NONE if done else StatusError.RESULT_FAIL, level=2)
 
-    def _read_group(self, packet: Packet, time: float) -> Iterator[tuple[int, float, bytes] | None]:
+    def _read_group(self, packet: Packet, time: float) -> Iterator[Answer | None]:
         p, fast = packet.parameters, packet.instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
         if packet.instruction in (Instruction.SYNC_READ, Instruction.FAST_SYNC_READ):
             address, size = int.from_bytes(p[:2], "little"), int.from_bytes(p[2:4], "little")
@@ -203,7 +192,7 @@ class SimServos:
                 found[0], StatusError.DATA_RANGE if data is None else 0, b"" if data is None else data[0]
             )
 
-    def _answer_fast(self, asked: list[tuple[int, int, int]], time: float) -> tuple[int, float, bytes] | None:
+    def _answer_fast(self, asked: list[tuple[int, int, int]], time: float) -> Answer | None:
         """One status packet from all; a silent servo ends it there."""
         length = 1 + sum(size + 4 for _, _, size in asked)
         raw = HEADER + bytes([BROADCAST]) + length.to_bytes(2, "little") + bytes([Instruction.STATUS])
@@ -218,7 +207,7 @@ class SimServos:
             raw += crc16(raw).to_bytes(2, "little")
         return None if first < 0 else (first, self._delay(first), raw)
 
-    def _write_group(self, packet: Packet, time: float) -> Iterator[tuple[int, float, bytes] | None]:
+    def _write_group(self, packet: Packet, time: float) -> Iterator[Answer | None]:
         p = packet.parameters
         if packet.instruction == Instruction.SYNC_WRITE:
             address, size = int.from_bytes(p[:2], "little"), int.from_bytes(p[2:4], "little")
@@ -250,31 +239,12 @@ class SimServos:
         Instruction.BULK_WRITE: _write_group,
     }
 
-    def _addressed(self, id: int, time: float) -> list[int]:
-        """Rows that listen to ``id``, by their ids as they are now."""
-        rows = self._row_of.values() if id == BROADCAST else [self._row_of[id]] if id in self._row_of else []
-        return [row for row in rows if time >= self._booting[row]]
-
-    def retune(self, bitrate: int) -> None:
-        """The host now talks at ``bitrate``: who listens at another hears nothing."""
-        self._bitrate = bitrate
-        self._readdress()
-
-    def _readdress(self) -> None:
-        """Whom an id means: of those that have power and listen at the host's bit rate. Of two with one id, one."""
-        known = self._bitrate in dynamixel.BAUD_RATES.values()  # else a line without any time on it
-        self._row_of = {
-            self._get(row, "ID"): row
-            for row in range(len(self.joints))
-            if self.powered[row] and not (known and dynamixel.BAUD_RATES[self._get(row, "BAUD")] != self._bitrate)
-        }
-
-    def _refuse(self, packet: Packet, time: float, error: StatusError) -> Iterator[tuple[int, float, bytes] | None]:
+    def _refuse(self, packet: Packet, time: float, error: StatusError) -> Iterator[Answer | None]:
         if packet.id != BROADCAST:
             for row in self._addressed(packet.id, time):
                 yield self._answer(row, error)
 
-    def _answer(self, row: int, error: int, data: bytes = b"", level: int = 1) -> tuple[int, float, bytes] | None:
+    def _answer(self, row: int, error: int, data: bytes = b"", level: int = 1) -> Answer | None:
         """``level``: the lowest status return level at which this is answered."""
         if self._get(row, "STATUS_RETURN_LEVEL") < level:
             return None
@@ -287,11 +257,6 @@ class SimServos:
         return self._get(row, "RETURN_DELAY") * 2e-6
 
     # -- control table -----------------------------------------------------------------------------------------------
-
-    def register(self, joint: str, name: str) -> int:
-        """What a servo's register holds."""
-        self._refresh()
-        return self._get(self.joints.index(joint), name)
 
     def _get(self, row: int, name: str) -> int:
         r = REGISTERS[name]
@@ -362,10 +327,10 @@ class SimServos:
             return
         self._stale = False
         t = self._table
-        t[:, 132:136] = _bytes(self.position, "<i4")
-        t[:, 128:132] = _bytes(self._sign * self._body.joint_vel / dynamixel.VELOCITY_UNIT, "<i4")
-        t[:, 126:128] = _bytes(self._sign * self._body.joint_torque / self._unit, "<i2")
-        t[:, 144:146] = _bytes(np.full(len(t), VOLTAGE), "<u2")
+        t[:, 132:136] = to_bytes(self.position, "<i4")
+        t[:, 128:132] = to_bytes(self._sign * self._body.joint_vel / dynamixel.VELOCITY_UNIT, "<i4")
+        t[:, 126:128] = to_bytes(self._sign * self._body.joint_torque / self._unit, "<i2")
+        t[:, 144:146] = to_bytes(np.full(len(t), VOLTAGE), "<u2")
         t[:, 146] = np.clip(self.temperature, 0, 255)
 
     @property
@@ -376,31 +341,18 @@ class SimServos:
 
     @property
     def enabled(self) -> np.ndarray:
-        """(n,) bool: torque is on."""
         return (self._table[:, RAM] > 0) & np.array(self.powered)
 
     # -- time --------------------------------------------------------------------------------------------------------
 
-    def act(self, start: float, end: float) -> None:
-        """Set the body's drive for the substep from ``start`` to ``end``."""
+    def _watch(self, now: float) -> None:
         ticks = self._table[:, WATCHDOG]
         running = (ticks > 0) & (ticks != dynamixel.WATCHDOG_TRIPPED) & (self._table[:, RAM] > 0)
-        for row in np.flatnonzero(running & (start - self._fed >= ticks * dynamixel.WATCHDOG_UNIT)):
+        for row in np.flatnonzero(running & (now - self._fed >= ticks * dynamixel.WATCHDOG_UNIT)):
             self._set(int(row), "GOAL_POSITION", round(float(self.position[row])))
             self._table[row, WATCHDOG] = dynamixel.WATCHDOG_TRIPPED
-            self._note(start, int(row), "watchdog")
+            self._note(now, int(row), "watchdog")
             self._changed = True
-        if start >= self._thermal_due:
-            self._warm(start)
-        self._stale = True
-        if self._changed:
-            old, new = self._law, self._decide()
-            share = np.clip((end - self._since) / (end - start), 0.0, 1.0)
-            self._body.drive(*(old + share * (new - old)))
-            self._law, self._changed, self._settle = new, False, True
-        elif self._settle:
-            self._body.drive(*self._law)
-            self._settle = False
 
     def _decide(self) -> np.ndarray:
         """The law (3, n) that goals and modes make: bias, kp, kd at the joints."""
@@ -420,12 +372,8 @@ class SimServos:
         bias += (mode == VELOCITY_MODE) * kd * self._column("GOAL_VELOCITY") * dynamixel.VELOCITY_UNIT
         return np.array([self._sign * bias, kp, kd]) * on
 
-    def _warm(self, now: float) -> None:
-        self._thermal_due = now + THERMAL_PERIOD
-        heat = (self._body.joint_torque / (RATED_SHARE * self._stall)) ** 2
-        self.temperature += (AMBIENT + ROTOR_RISE * heat - self.temperature) * (THERMAL_PERIOD / ROTOR_TIME)
-        for row in np.flatnonzero(self.temperature > self._column("TEMPERATURE_LIMIT")):
-            self.fail(self.joints[row], OVERHEATING, now)
+    def _overheat(self, row: int, now: float) -> None:
+        self.fail(self.joints[row], OVERHEATING, now)
 
     # -- state -------------------------------------------------------------------------------------------------------
 
@@ -440,18 +388,10 @@ class SimServos:
         if self._shut(row) and self._get(row, "TORQUE_ENABLE"):
             self._switch(row, False, time, "shut down")
 
-    def power(self, row: int, on: bool, time: float) -> None:
-        """Take a servo's supply away, or give it back."""
-        if self.powered[row] == on:
-            return
-        self.powered[row] = on
-        self._readdress()
-        self._restart(row, time, "powered on" if on else "powered off")
-
     def _restart(self, row: int, time: float, event: str) -> None:
         """EEPROM stays; RAM is the factory's; the count of turns is lost."""
         self._table[row, RAM:] = self._factory[row, RAM:]
-        self._booting[row] = time + BOOT_TIME
+        self._booting[row] = time + self.BOOT_TIME
         self._registered.pop(row, None)
         self._lose_turns(row)
         self._switch(row, False, time, event)
@@ -474,15 +414,6 @@ class SimServos:
         self._since[row] = time
         self._stale = self._changed = True
         self._note(time, row, event)
-
-    def _note(self, time: float, row: int, event: str) -> None:
-        self.log.append(MotorEvent(time, self.spec.name, self.joints[row], event))
-
-
-def _bytes(values: np.ndarray, kind: str) -> np.ndarray:
-    """(n, size) uint8 of numbers, rounded and saturated."""
-    limits = np.iinfo(kind)
-    return np.clip(np.rint(values), limits.min, limits.max).astype(kind).reshape(-1, 1).view(np.uint8)
 
 
 @cache

@@ -1,6 +1,6 @@
 """The host's ends of a World in another process (see serve.py): unix SEQPACKET sockets, a whole tick a datagram.
 
-A bus socket carries rows of FRAME. What SocketCAN would tell in error frames, the served bus tells in the same ones
+A bus socket carries rows of FRAME, of a CAN-FD bus of FD_FRAME. What SocketCAN would tell in error frames, the served bus tells in the same ones
 (linux/can/error.h), and sending then raises as it would on a real controller.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from drivers.sim.motor import MotorEvent
 from drivers.sim.truth import Truth
-from drivers.wire import ERROR, FRAME, WireError, WireFull, WireGone
+from drivers.wire import ERROR, WireError, WireFull, WireGone, frame_type
 
 DATAGRAM = 1 << 18  # bytes: more than any tick
 ANSWER_TIME = 2.0  # s that a call may take
@@ -86,8 +86,9 @@ class HostSocket:
 class SocketCanWire:
     """A drivers.wire.CanWire to the bus served at ``path``."""
 
-    def __init__(self, path: str | Path):
+    def __init__(self, path: str | Path, data_bitrate: int = 0):
         self._socket = HostSocket(path)
+        self._frame = frame_type(data_bitrate)
         self._away = self._full = False
 
     def send(self, frames: np.ndarray) -> None:
@@ -99,7 +100,7 @@ class SocketCanWire:
             raise WireFull(f"{self._socket.path}: transmit queue full; the bus is too slow, or nobody acknowledges")
 
     def recv(self) -> np.ndarray:
-        frames = np.frombuffer(self._socket.receive(), FRAME)
+        frames = np.frombuffer(self._socket.receive(), self._frame)
         errors = frames[frames["id"] & ERROR != 0] if len(frames) else frames
         for id, reason in zip(errors["id"].tolist(), errors["data"][:, 1].tolist(), strict=True):
             self._away = (self._away or bool(id & BUS_OFF)) and not id & RESTARTED

@@ -1,10 +1,11 @@
-"""A simulated classic CAN bus: every frame takes its exact time on the wire, and the lowest identifier goes first.
+"""A simulated CAN or CAN-FD bus: every frame takes its exact time on the wire, and the lowest identifier goes first.
 
 The host is a controller with one FIFO (so that its later, more urgent frames wait behind earlier ones); every motor is a
 node of its own that answers ``reply_delay`` after a frame has ended. An adapter adds ``latency`` either way. A frame
 that nobody on the bus acknowledges is sent again for ever, as real controllers do: then the queue fills up.
 
-Not modelled: error-passive nodes, overload frames, two nodes sending one identifier at once, clock tolerance, CAN FD.
+Not modelled: error-passive nodes, overload frames, two nodes sending one identifier at once, clock tolerance, an error in
+the middle of a CAN-FD payload (it breaks the frame off at its end).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 
 from drivers.bus import BusSpec
 from drivers.sim.faults import FEEDBACK, HOST, POWER, Fault
-from drivers.wire import EXTENDED, FRAME, WireError, WireFull
+from drivers.wire import EXTENDED, FRAME, WireError, WireFull, frame_type
 
 ERROR_FRAME_BITS = 20  # error flag (6), its superposition (up to 6), delimiter (8), as good as always
 BUS_OFF_COUNT = 256  # ISO 11898-1: transmit error counter at which a controller leaves the bus
@@ -86,6 +87,7 @@ class SimCan:
         queue_length: int = QUEUE_LENGTH,
     ):
         self.spec, self.index, self.traffic = spec, index, Traffic()
+        self.frame = frame_type(spec.data_bitrate)
         self.rows = {m.id: first_row + i for i, m in enumerate(spec.motors)}
         self.sent: list[tuple[float, bytes]] = []  # by the host, not yet timed: (ready, raw frames)
         self.inbox: deque[tuple[float, bytes]] = deque()  # (arrival at the host, raw frame)
@@ -107,7 +109,7 @@ class SimCan:
     # -- the host's end ----------------------------------------------------------------------------------------------
 
     def send(self, frames: np.ndarray, now: float) -> None:
-        """Queue frames (FRAME, (n,)). Raises WireFull, or WireError while the controller is off the bus."""
+        """Queue frames (``frame``, (n,)). Raises WireFull, or WireError while the controller is off the bus."""
         if self._host_faults or now < self._away_until:
             if self.away(now):
                 raise WireError(f"{self.spec.name}: bus off; check cable and termination")
@@ -115,7 +117,7 @@ class SimCan:
                 if fault.kind == "no_buffer" and fault.start <= now < fault.end:
                     if self._random.random() < fault.probability:
                         self._refuse(len(frames), 0)
-        room = max(0, self._room - len(self._queue) - sum(len(raw) for _, raw in self.sent) // FRAME.itemsize)
+        room = max(0, self._room - len(self._queue) - sum(len(raw) for _, raw in self.sent) // self.frame.itemsize)
         if room and len(frames):
             self.sent.append((now + self._latency, frames[:room].tobytes()))
         if len(frames) > room:
@@ -129,12 +131,12 @@ class SimCan:
         )
 
     def recv(self, now: float) -> np.ndarray:
-        """Frames (FRAME, (n,)) that have reached the host by ``now``."""
+        """Frames (``frame``, (n,)) that have reached the host by ``now``."""
         inbox = self.inbox
         raws: list[bytes] = []
         while inbox and inbox[0][0] <= now + TOLERANCE:
             raws.append(inbox.popleft()[1])
-        return np.frombuffer(b"".join(raws), FRAME)
+        return np.frombuffer(b"".join(raws), self.frame)
 
     def retune(self, bitrate: int) -> None:
         """The host's controller was started anew, at ``bitrate``; what it still had to send is gone."""
@@ -147,8 +149,9 @@ class SimCan:
 
     def take(self, ready: float, raw: bytes, ids: Iterable[int], bits: Iterable[int]) -> None:
         """Frames of the host, whose length on the wire is now known, enter its controller's queue."""
+        size = self.frame.itemsize
         for i, (id, n) in enumerate(zip(ids, bits, strict=True)):
-            self._queue.append((ready, priority(id), id, raw[16 * i : 16 * i + 16], n, 0))
+            self._queue.append((ready, priority(id), id, raw[size * i : size * i + size], n, 0))
 
     def say(self, ready: float, answer: tuple[int, int, bytes, int]) -> None:
         """A motor wants to send a frame (row, key, raw frame, bits) from ``ready`` on, without having been asked."""
@@ -328,8 +331,8 @@ class SimCan:
         if fault.kind == "stuck":
             return self._stuck.setdefault((id(fault), row), raw)
         if fault.kind == "garbage":
-            return raw[:8] + self._random.randbytes(8)
-        at = self._random.randrange(64)
+            return raw[:8] + self._random.randbytes(len(raw) - 8)
+        at = self._random.randrange(64 if self.frame == FRAME else max(1, 8 * raw[4]))
         data = bytearray(raw)
         data[8 + at // 8] ^= 1 << at % 8
         return bytes(data)

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.budget import frame_bits
+from drivers.budget import bits_of
 from drivers.bus import BusError, BusSpec, ImuSpec
 from drivers.open import PROTOCOLS, load
 from drivers.sim.ball import Ball
@@ -32,7 +32,6 @@ from drivers.sim.motor import MotorEvent, SimMotors
 from drivers.sim.plant import Plant
 from drivers.sim.truth import Truth
 from drivers.sim.wire import QUEUE_LENGTH, TOLERANCE, SimCan, SimCanWire
-from drivers.wire import FRAME
 
 
 class World:
@@ -96,7 +95,7 @@ class World:
         queue_length: int = QUEUE_LENGTH,
     ) -> None:
         """Put motors and IMU on the plant, and wires to them. ``registers`` and ``wrap``: see SimMotors."""
-        self.motors = _motors_of(buses)(buses, self.plant, frame_bits, registers=registers, wrap=wrap)
+        self.motors = _motors_of(buses)(buses, self.plant, bits_of(buses[0]), registers=registers, wrap=wrap)
         firsts = np.cumsum([0, *(len(b.motors) for b in buses)]).tolist()
         self.buses = [
             SimCan(spec, i, firsts[i], self.motors, seed=seed, latency=latency, reply_delay=reply_delay,
@@ -153,10 +152,11 @@ class World:
             return
         raws = b"".join([raw for _, _, raw in sent])
         bits = self.motors.refresh(raws)
-        ids = np.frombuffer(raws, FRAME)["id"].tolist()
+        frame = self.buses[0].frame
+        ids = np.frombuffer(raws, frame)["id"].tolist()
         at = 0
         for bus, ready, raw in sent:
-            end = at + len(raw) // FRAME.itemsize
+            end = at + len(raw) // frame.itemsize
             bus.take(ready, raw, ids[at:end], bits[at:end])
             bus.sent.clear()
             at = end

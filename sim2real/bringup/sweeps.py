@@ -13,7 +13,17 @@ from typing import NamedTuple
 import numpy as np
 
 from drivers.bus import Clock
-from drivers.codecs import dynamixel, dynamixel_packet, feetech, mini_cheetah, odrive, recoil, robstride
+from drivers.codecs import (
+    dynamixel,
+    dynamixel_packet,
+    feetech,
+    mini_cheetah,
+    moteus,
+    moteus_frame,
+    odrive,
+    recoil,
+    robstride,
+)
 from drivers.wire import FRAME, REMOTE, CanWire, SerialWire, make_frames
 from sim2real.bringup.sweep import BATCH, TRIES, Found, Sweep, converse, sweep_damiao
 
@@ -149,6 +159,29 @@ def sweep_mit(wire: CanWire, clock: Clock, ids: Iterable[int] = range(1, 0x80)) 
     return swept
 
 
+def sweep_moteus(wire: CanWire, clock: Clock, ids: Iterable[int] = range(1, moteus.ID_MAX + 1)) -> Sweep:
+    """By questions for serial number, firmware and state. On CAN-FD."""
+    swept, found, times = Sweep([], protocol="moteus"), {}, {}
+    question = moteus.ASK_SERIAL + moteus.ASK_FIRMWARE + bytes(moteus.QUESTIONS)
+    ids = list(ids)
+    for n, frame in _ask_all(wire, clock, ids, swept, lambda id: moteus.pack_question(id, question)):
+        id, payload = int(frame["id"]) >> 8 & 0x7F, frame["data"][: frame["length"]].tobytes()
+        try:
+            serial, told = moteus_frame.serial_number(payload), moteus_frame.registers_of(payload)
+        except ValueError:
+            continue
+        if serial is None or id not in ids:
+            continue
+        motor = _enter(found, id, times, n)
+        motor.duplicate |= motor.registers.setdefault(moteus.SERIAL, serial) != serial
+        version = int(told.get(moteus_frame.Register.FIRMWARE) or 0)
+        motor.firmware = ".".join(str(version >> shift & 0xFF) for shift in (16, 8, 0))
+        fault = int(told.get(moteus_frame.Register.FAULT) or 0)
+        motor.error = moteus.fault_name(fault) if told.get(moteus_frame.Register.MODE) == moteus.Mode.FAULT else ""
+    swept.motors = [found[id] for id in sorted(found)]
+    return swept
+
+
 # -- serial lines ----------------------------------------------------------------------------------------------------
 
 
@@ -252,6 +285,7 @@ class Survey(NamedTuple):
     sweep: Callable[..., Sweep]
     bitrates: tuple[int, ...]
     serial: bool = False
+    data_bitrate: int = 0  # of CAN-FD payloads
 
 
 CAN_RATES = (1_000_000, 500_000, 250_000, 125_000)
@@ -263,6 +297,7 @@ SWEEPS: dict[str, Survey] = {
     "mini_cheetah": Survey(sweep_mit, CAN_RATES),
     "cubemars": Survey(sweep_mit, CAN_RATES),
     "robstride_mit": Survey(sweep_mit, CAN_RATES),
+    "moteus": Survey(sweep_moteus, (1_000_000,), data_bitrate=moteus.DATA_BITRATE),
     "dynamixel": Survey(
         sweep_dynamixel, (57_600, 1_000_000, 4_000_000, 3_000_000, 2_000_000, 4_500_000, 115_200, 9600), serial=True
     ),

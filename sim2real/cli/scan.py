@@ -121,7 +121,8 @@ def _buses(args: Args) -> tuple[list[BusSpec], Any, Clock]:
         if args.protocol not in PROTOCOLS:
             close = did_you_mean(args.protocol, PROTOCOLS)
             raise Sim2realError(f"--protocol: got '{args.protocol}'{close}, expected one of {', '.join(SWEEPS)}")
-        spec = BusSpec(args.channel, args.protocol, (), args.interface, args.channel, args.bitrate)
+        fd = SWEEPS[args.protocol].data_bitrate if args.protocol in SWEEPS else 0
+        spec = BusSpec(args.channel, args.protocol, (), args.interface, args.channel, args.bitrate, data_bitrate=fd)
         return [spec], None, MonotonicClock()
     config = load_robot(args.robot)
     wiring = config.wiring(args.wiring)

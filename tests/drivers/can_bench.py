@@ -22,6 +22,7 @@ RIGS: dict[str, tuple[str, list[tuple[int, int]]]] = {
     "cubemars": ("AK80-9", [(1, 0), (2, 0)]),
     "robstride_mit": ("RS02", [(1, 0), (0x7F, 0)]),
     "odrive": ("D6374-8:1", [(0, 0), (63, 0)]),
+    "moteus": ("qdd100-beta2", [(1, 0), (0x7E, 0)]),
 }
 WATCHDOG = 0.05  # s
 FORGETFUL = ("mini_cheetah", "cubemars", "robstride_mit")  # take up the next command as if nothing had been
@@ -30,6 +31,7 @@ SET_BEFORE = {
     **{name: {joint: {"TIMEOUT": WATCHDOG / CYCLE} for joint in ("left", "right")} for name in FORGETFUL},
     "odrive": {joint: {"WATCHDOG_TIMEOUT": WATCHDOG} for joint in ("left", "right")},
 }
+DATA_BITRATES = {"moteus": 5_000_000}  # of those on CAN-FD
 RATE = 250.0  # Hz
 
 
@@ -38,7 +40,7 @@ def rig(protocol: str, **changes: Any) -> BusSpec:
     motors = tuple(MotorSpec(joint, model, *id) for joint, id in zip(("left", "right"), ids, strict=True))
     return BusSpec(
         **{"name": "arm", "protocol": protocol, "motors": motors}
-        | {"watchdog": WATCHDOG * PROTOCOLS[protocol].watchdog}
+        | {"watchdog": WATCHDOG * PROTOCOLS[protocol].watchdog, "data_bitrate": DATA_BITRATES.get(protocol, 0)}
         | changes
     )
 

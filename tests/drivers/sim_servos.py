@@ -1,15 +1,14 @@
-"""A bench of emulated Dynamixel servos, each turning a wheel, moved on in lockstep by the clock of its host."""
+"""A bench of emulated servos, each turning a wheel, moved on in lockstep by the clock of its host."""
 
 from __future__ import annotations
 
 from drivers.bus import BusSpec
-from drivers.codecs.dynamixel import DynamixelCodec
-from drivers.codecs.dynamixel_packet import Packet, Parser
+from drivers.codecs.dynamixel_packet import Packet
+from drivers.open import PROTOCOLS, load, open_bus
 from drivers.serial_bus import SerialBus
 from drivers.sim.faults import parse_fault
 from drivers.sim.serial_line import SerialLine, SerialLineWire
 from drivers.sim.serial_pty import Wheels, bus_of
-from drivers.sim.servo import SimServos
 
 SUBSTEP = 0.002  # s
 PERIOD = 0.004  # s between two ticks
@@ -22,14 +21,14 @@ class Bench:
         timing = {k: options.pop(k) for k in ("latency", "gap") if k in options}
         self.spec = spec or bus_of("XM430-W350", n)
         self.body = Wheels(len(self.spec.motors))
-        self.servos = SimServos(self.spec, self.body, **options)
+        self.servos = load(PROTOCOLS[self.spec.protocol].motors)(self.spec, self.body, **options)
         self.line = SerialLine(self.spec, self.servos, seed=seed, **timing)
         for fault in faults:
             self.line.inject(parse_fault(fault))
         self.time = 0.0
         self._substeps = 0
         self.wire = SerialLineWire(self.line, self.now)
-        self._parser = Parser()
+        self._parser = self.servos.parser()
 
     def now(self) -> float:
         return self.time
@@ -49,7 +48,7 @@ class Bench:
         self.sleep_until(self.time + seconds)
 
     def connected(self) -> SerialBus:
-        bus = SerialBus(self.spec, DynamixelCodec(self.spec), self.wire)
+        bus = open_bus(self.spec, self.wire)
         bus.connect(self)
         return bus
 

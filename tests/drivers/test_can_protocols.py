@@ -14,7 +14,7 @@ from sim_robots import ARM_INERTIA
 from drivers.budget import budget
 from drivers.bus import BusError, MotorState
 from drivers.open import PROTOCOLS, open_codec
-from drivers.wire import EXTENDED, make_frames
+from drivers.wire import EXTENDED, frame_type
 
 CAN = [name for name, protocol in PROTOCOLS.items() if protocol.wire == "can"]
 pytestmark = pytest.mark.parametrize("protocol", CAN)
@@ -217,10 +217,10 @@ raw_frames = st.lists(
 @settings(max_examples=150)
 @given(raw_frames, st.integers(0, 3))
 def test_any_frames_leave_a_finite_state(protocol, frames, variation):
-    made = make_frames(np.zeros(len(frames), np.uint32), np.zeros((len(frames), 8), np.uint8))
+    made = np.zeros(len(frames), frame_type(rig(protocol).data_bitrate))
     for row, (id, extended, length, data) in zip(made, frames, strict=True):
         row["id"] = id | EXTENDED if extended else id & 0x7FF
-        row["length"], row["data"] = length, list(data)
+        row["length"], row["data"][:8] = length, list(data)
     codec, state = open_codec(rig(protocol)), MotorState.empty(2)
     codec.pack_poll(state)
     codec.owners(made)

@@ -14,7 +14,7 @@ from scripted_can import leg
 from drivers.can_wire import PythonCanWire, RawCanWire, interfaces
 from drivers.codecs import damiao
 from drivers.codecs.damiao import DamiaoCodec, DamiaoMotors
-from drivers.wire import ERROR, EXTENDED, FRAME, REMOTE, WireError, WireFull, make_frames
+from drivers.wire import ERROR, EXTENDED, FRAME, REMOTE, WireError, WireFull, make_fd_frames, make_frames
 
 
 def frames(n: int = 4) -> np.ndarray:
@@ -184,5 +184,59 @@ def test_socketcan_loopback():
         pytest.skip(str(error).splitlines()[0])
     a.send(frames())
     assert b.recv().tobytes() == frames().tobytes()
+    a.close()
+    b.close()
+
+
+def fd_frames(n: int = 4) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    made = make_fd_frames(np.arange(1, n + 1), rng.integers(0, 256, (n, 64), np.uint8), 64)
+    made["id"][-1] |= np.uint32(EXTENDED)
+    made["length"][0], made["data"][0, 12:] = 12, 0
+    made["flags"][1] = 0  # without bit-rate switch
+    return made
+
+
+def test_fd_frames_through_python_can(channel):
+    wire = PythonCanWire("virtual", channel, 1_000_000, 5_000_000)
+    peer = can.Bus(interface="virtual", channel=channel)
+    wire.send(fd_frames())
+    received = [peer.recv(timeout=0) for _ in range(4)]
+    assert all(m.is_fd for m in received) and [m.bitrate_switch for m in received] == [True, False, True, True]
+    assert [bytes(m.data) for m in received] == [f["data"][: f["length"]].tobytes() for f in fd_frames()]
+    for m in received:
+        peer.send(m)
+    assert wire.recv().tobytes() == fd_frames().tobytes()
+    peer.send(can.Message(arbitration_id=5, data=b"abc", is_extended_id=False))
+    (classic,) = wire.recv()
+    assert classic["length"] == 3 and not classic["flags"] and classic["data"][:4].tobytes() == b"abc\0"
+    wire.close()
+    peer.shutdown()
+
+
+def test_raw_fd_frames_are_struct_canfd_frame():
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    wire = RawCanWire(ours, fd=True)
+    wire.send(make_fd_frames(np.array([0x8001 | EXTENDED], np.uint32), np.arange(12, dtype=np.uint8)[None], 12))
+    # linux/can.h: can_id, length, flags (CANFD_BRS), two bytes reserved, 64 bytes of data
+    assert theirs.recv(100).hex(" ") == "01 80 00 80 0c 01 00 00 " + bytes(range(12)).ljust(64, b"\0").hex(" ")
+    theirs.send(fd_frames()[0].tobytes())
+    theirs.send(frames()[1].tobytes())  # a classic frame, as an error frame is
+    first, second = wire.recv()
+    assert first == fd_frames()[0]
+    assert second["id"] == 2 and second["length"] == 8 and second["data"][:8].tobytes() == frames()["data"][1].tobytes()
+    wire.close()
+    theirs.close()
+
+
+def test_socketcan_fd_loopback():
+    """On a machine with ``vcan0`` of mtu 72."""
+    try:
+        a, b = RawCanWire.open("vcan0", data_bitrate=5_000_000), RawCanWire.open("vcan0", data_bitrate=5_000_000)
+    except WireError as error:
+        pytest.skip(str(error).splitlines()[0])
+    a.send(fd_frames())
+    received = b.recv()
+    assert received["data"].tobytes() == fd_frames()["data"].tobytes()
     a.close()
     b.close()

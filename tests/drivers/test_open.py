@@ -28,7 +28,7 @@ def test_every_protocol_loads(protocol):
 
 @pytest.mark.parametrize("protocol", IMUS)
 def test_every_imu_loads(protocol):
-    assert load(IMUS[protocol])().feed(b"") == []
+    assert load(IMUS[protocol].parser)().feed(b"") == []
 
 
 def test_every_wiring_of_every_robot_has_its_protocols(robot):

@@ -17,6 +17,7 @@ from sim_robots import BOX, BUS, CLEAR, ENABLE, IMU, REFRESH, answers, make_worl
 
 from drivers.bus import BusError
 from drivers.codecs import hipnuc
+from drivers.sim.bridge import can_bridge
 from drivers.sim.serve import serve, world_of
 from drivers.sim.socket_wire import SocketCanWire, SocketSerialWire, WorldRemote
 from drivers.wire import ERROR, CanWire, WireError, WireFull, make_frames
@@ -226,7 +227,11 @@ def test_a_stranger_with_python_can(tmp_path):
     thread = threading.Thread(
         target=serve,
         args=(world, tmp_path),
-        kwargs={"ready": started.set, "goes_on": lambda: not stop.is_set(), "can": {"arm": "virtual:twin"}},
+        kwargs={
+            "ready": started.set,
+            "goes_on": lambda: not stop.is_set(),
+            "bridges": {"arm": can_bridge(BUS, "virtual:twin")},
+        },
     )
     with can.Bus(interface="virtual", channel="twin") as bus:
         thread.start()

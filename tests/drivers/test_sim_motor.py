@@ -293,8 +293,8 @@ def test_a_hot_rotor_disables_itself(host):
 
 
 def test_unknown_protocol_is_refused_by_name(tmp_path):
-    with pytest.raises(BusError, match="arm.*'moteus'.*damiao"):
-        make_world(tmp_path, bus=BusSpec("arm", "moteus", BUS.motors))
+    with pytest.raises(BusError, match="arm.*'dynamixel'.*damiao"):
+        make_world(tmp_path, bus=BusSpec("arm", "dynamixel", BUS.motors))
 
 
 def test_extended_and_short_frames_are_ignored(host):

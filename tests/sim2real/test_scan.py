@@ -9,12 +9,12 @@ import pytest
 import yaml
 
 from drivers.bus import BusSpec, MotorSpec
-from drivers.codecs import damiao, dynamixel_packet
+from drivers.codecs import damiao, dynamixel_packet, feetech
 from drivers.codecs.damiao import Operation
 from drivers.open import PROTOCOLS, open_world
 from drivers.wire import ERROR, EXTENDED, FRAME, make_frames
 from sim2real.bringup.sweep import Found, Sweep, sweep_damiao, verdicts
-from sim2real.bringup.sweeps import sweep_dynamixel, sweep_feetech, sweep_robstride
+from sim2real.bringup.sweeps import SWEEPS, sweep_dynamixel, sweep_feetech, sweep_robstride
 from sim2real.cli import main
 from sim2real.cli.scan import _sweep
 from sim2real.clock import SimClock
@@ -192,8 +192,9 @@ def rig(tmp_path, protocol: str, model: str, bitrate: int, **options):
     """The bench robot with other motors, as a YAML."""
     document = yaml.safe_load((CONFIG_DIR / "bench.yaml").read_text())
     (bus,) = document["wirings"]["can"]["buses"]
-    watchdog = 0.08 if PROTOCOLS[protocol].watchdog else 0.0
+    watchdog = 0.08 if PROTOCOLS[protocol].watchdog else feetech.NO_WATCHDOG if protocol == "feetech" else 0.0
     bus |= {"protocol": protocol, "bitrate": bitrate, "watchdog": watchdog}
+    bus |= {"data_bitrate": SWEEPS[protocol].data_bitrate}
     if PROTOCOLS[protocol].wire == "serial":
         bus["interface"] = "serial"
     for motor, id in zip(bus["motors"], (3, 5), strict=True):
@@ -212,7 +213,9 @@ RIGS = {
     "mini_cheetah": ("mini-cheetah", 1_000_000, ""),
     "cubemars": ("AK80-9", 1_000_000, ""),
     "robstride_mit": ("RS02", 1_000_000, ""),
+    "moteus": ("qdd100-beta2", 1_000_000, ""),
     "dynamixel": ("XM430-W350", 1_000_000, "XM430-W350"),
+    "feetech": ("STS3215-12V", 1_000_000, "STS3215-12V"),
 }
 
 

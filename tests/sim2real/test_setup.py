@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import yaml
-from test_scan import Clock, rig
+from test_scan import rig
 
 from drivers.bus import BusSpec, MotorSpec
 from drivers.codecs import feetech
-from sim2real.bringup.setup import Bench, MotorList, load_list
+from sim2real.bringup.setup import Bench, load_list
 from sim2real.cli import main
 from sim2real.cli.setup import Bag
 from sim2real.config import load_robot
 from sim2real.robot import open_robot
 from sim2real.types import Sim2realError
 
-RIGS = {"damiao": ("DM4310", 1_000_000), "robstride": ("RS02", 1_000_000), "dynamixel": ("XM430-W350", 1_000_000)}
+RIGS = {
+    "damiao": ("DM4310", 1_000_000),
+    "robstride": ("RS02", 1_000_000),
+    "dynamixel": ("XM430-W350", 1_000_000),
+    "feetech": ("STS3215-12V", 500_000),
+}
+SERIAL = {"dynamixel": 57_600, "feetech": 1_000_000}  # no serial numbers; bit/s of a new one
 
 
 @pytest.fixture(autouse=True)
@@ -46,8 +51,8 @@ def test_new_motors_become_those_of_the_wiring_and_the_robot_connects(protocol, 
     (spec,) = config.wiring().bus_specs()
     records = [bag.bench(spec, motor).set_up(motor) for motor in spec.motors]
     assert [r.id for r in records] == [3, 5] and len({r.found_id for r in records}) == 1
-    assert protocol == "dynamixel" or len({r.fingerprint for r in records}) == 2
-    assert protocol != "dynamixel" or records[0].found_bitrate == 57_600
+    assert protocol in SERIAL or len({r.fingerprint for r in records}) == 2
+    assert records[0].found_bitrate == SERIAL.get(protocol, spec.bitrate)
     for motor in spec.motors:
         bag._power(spec, motor.joint, True)
     bag.clock.sleep_until(bag.clock.now() + 1.0)
@@ -61,6 +66,23 @@ def test_nothing_ever_had_torque(tmp_path):
     bag, spec = bag_of(tmp_path)
     bag.bench(spec, spec.motors[0]).set_up(spec.motors[0])
     assert {e.event for e in bag.world.motor_log} <= {"powered on", "powered off"}
+
+
+def test_a_feetech_servo_is_locked_again_at_its_new_bit_rate(tmp_path):
+    """What it was told afterwards does not outlive its power."""
+    bag, spec = bag_of(tmp_path, "feetech")
+    (motor, _), (line,) = spec.motors, bag.world.lines
+    record = bag.bench(spec, motor).set_up(motor)
+    servos = line.servos
+    held = {name: servos.register(motor.joint, name) for name in ("ID", "BAUD", "RETURN_DELAY", "LOCK", "POSITION_MAX")}
+    assert held == {"ID": 3, "BAUD": 1, "RETURN_DELAY": 0, "LOCK": 1, "POSITION_MAX": 4095}
+    assert record.fingerprint == "MODEL 777" and record.settings["ID"] == 3
+    bag.world.wires[spec.name].write(feetech.pack(3, feetech.Instruction.WRITE, bytes([5, 9])))
+    bag.clock.sleep_until(bag.clock.now() + 0.1)
+    assert servos.register(motor.joint, "ID") == 9
+    for on in (False, True):
+        bag._power(spec, motor.joint, on)
+    assert servos.register(motor.joint, "ID") == 3
 
 
 def test_the_command_writes_a_list_and_goes_on_from_it(tmp_path, capsys):
@@ -127,73 +149,3 @@ def test_a_protocol_without_such_frames_is_refused(tmp_path, capsys):
     path = rig(tmp_path, "recoil", "6512", 1_000_000)
     assert main(["setup", "--robot", path, "--sim"]) == 2
     assert "no frame sets up 'recoil' motors" in capsys.readouterr().err
-
-
-class Servo:
-    """A Feetech servo by its bytes: a SerialWire at 500 kbit/s and id 1 until it is told otherwise."""
-
-    def __init__(self) -> None:
-        self.eeprom = bytearray(40)
-        self.eeprom[0:8] = bytes([3, 9, 0, 0x09, 0x03, 1, 1, 10])
-        self.ram = bytearray(48)
-        self.waiting = b""
-        self.lit = 0
-
-    def write(self, data: bytes) -> None:
-        assert data[:2] == b"\xff\xff" and ~sum(data[2:-1]) & 0xFF == data[-1]
-        table = self.eeprom + self.ram
-        if data[2] != table[5]:
-            return
-        if data[4] == feetech.Instruction.READ:
-            body = bytes([table[5], 2 + data[6], 0]) + bytes(table[data[5] : data[5] + data[6]])
-            self.waiting += b"\xff\xff" + body + bytes([~sum(body) & 0xFF])
-        else:
-            assert data[4] == feetech.Instruction.WRITE
-            for at, byte in enumerate(data[6:-1], data[5]):
-                if at < 40 and table[55] == 0:
-                    self.eeprom[at] = byte
-                elif at >= 40:
-                    self.ram[at - 40] = byte
-
-    def read(self) -> bytes:
-        data, self.waiting = self.waiting, b""
-        return data
-
-    def power_off(self) -> None:
-        self.ram = bytearray(48)
-        self.ram[55 - 40] = 1  # LOCK
-
-    def turn(self, on: bool) -> None:
-        self.ram[56 - 40 : 58 - 40] = (500 * on).to_bytes(2, "little")
-
-
-class Port:
-    """As a simulated world whose one line hears the servo only at the servo's bit rate."""
-
-    def __init__(self, spec: BusSpec, servo: Servo) -> None:
-        self.spec, self.servo, self.buses, self.wires = spec, servo, [self], {spec.name: self}
-        self.bitrate = 0
-
-    def retune(self, bitrate: int) -> None:
-        self.bitrate = bitrate
-
-    def write(self, data: bytes) -> None:
-        if feetech.BAUD_RATES[self.servo.eeprom[6]] == self.bitrate:
-            self.servo.write(data)
-
-    def read(self) -> bytes:
-        return self.servo.read()
-
-
-def test_a_feetech_servo_is_set_up_by_its_bytes():
-    spec = BusSpec("arm", "feetech", (MotorSpec("elbow", "STS3215-12V", 12),), "serial", "/dev/ttyUSB0", 1_000_000,
-                   feetech.NO_WATCHDOG)  # fmt: skip
-    servo = Servo()
-    servo.power_off()
-    bench = Bench(spec, Port(spec, servo), Clock(), servo.power_off, servo.turn)
-    record = bench.set_up(spec.motors[0])
-    assert (record.found_id, record.found_bitrate, record.id) == (1, 500_000, 12)
-    assert servo.eeprom[5] == 12 and servo.eeprom[6] == 0 and servo.eeprom[7] == 0
-    assert int.from_bytes(servo.eeprom[11:13], "little") == 4095
-    assert record.fingerprint == "MODEL 777" and servo.ram[55 - 40] == 1  # locked again
-    np.testing.assert_equal(MotorList(robot="r", wiring="w", motors=[record]).motors[0].settings["ID"], 12)
