@@ -32,9 +32,9 @@ class Stride:
     load: float = 1.0  # share of the body's weight that a standing leg is told of beforehand
     upright: float = 1.8  # rad of a standing leg's hip per rad that the trunk is pitched or rolled
     reach: float = 0.5  # rad, the furthest of either
-    ahead: float = 0.10  # rad of the capture point beyond which a step is needed: forwards,
-    behind: float = 0.12  # backwards,
-    aside: float = 0.16  # and sideways
+    ahead: float = 0.07  # rad of the capture point beyond which a step is needed: forwards,
+    behind: float = 0.08  # backwards,
+    aside: float = 0.11  # and sideways
     calm: float = 0.5  # share of these below which the clock may rest
     acceleration: float = 1.2  # m/s^2 (rad/s^2) of a command
     idle: float = 0.05  # m/s (rad/s): a smaller command is none
