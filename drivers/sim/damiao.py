@@ -151,7 +151,10 @@ class SimDamiao(SimMotors):
             column("PMAX"), column("VMAX"), column("TMAX"), np.full(n, damiao.KP_MAX), np.full(n, damiao.KD_MAX)
         )
         self._tuned = self._tuned or [damiao.BIT_RATES.get(int(rate), 0) for rate in column("CAN_BR")]
-        self._listen(list(zip(column("ESC_ID").astype(int), column("MST_ID").astype(int), strict=True)), self._tuned)
+        ids = (
+            column(name).astype(np.int64) & 0x7FF for name in ("ESC_ID", "MST_ID")
+        )  # an id has 11 bits, whatever is written
+        self._listen(list(zip(*ids, strict=True)), self._tuned)
         self._keys = [priority(m.feedback_id) for m in self.specs]
         self._decoders = []
         for bus, (first, b) in enumerate(zip(self._first, self._bus_specs, strict=True)):
