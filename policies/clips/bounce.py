@@ -24,7 +24,7 @@ from policies.physics import standing_height
 GRAVITY = 9.81  # m/s^2
 SOLVER = "daqp"
 CLEAR = 0.015  # m between palm and ball while they do not touch
-SMOOTHING = 0.8  # frames
+SMOOTHING = 0.5  # frames
 SETTLING = 3  # strokes before the one that is kept: then inverse kinematics has forgotten where it began
 
 
