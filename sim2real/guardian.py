@@ -95,6 +95,7 @@ class Guardian:
         self._enabling: float | None = None  # since when
         self._arm_seen = False
         self._lost = np.zeros(len(robot.config.joint_names), bool)  # were silent so long since connecting
+        self._asked, self._sensed = np.inf, -np.inf  # s, when this process first listened, and when it last did
         self._ending: float | None = None
         self._told_fault: object = None
         self._told_error = ""
@@ -117,7 +118,11 @@ class Guardian:
         self._failed = Calls(0)
         self._guard(lambda: self.robot.read(start, self._state), Calls.STOP)
         r["time"][0], r["tick"][0], r["late"][0], r["timing.lateness"][0] = scheduled, self._tick, late, lateness
-        self._lost |= np.isfinite(self._state.joint_age) & (self._state.joint_age > self.restart_time)
+        # Silence before anybody asked, and while nobody listened because this process was late, is no sign of a motor's.
+        self._asked = min(self._asked, start)
+        silent = np.minimum(self._state.joint_age, start - self._asked) - (start - self._sensed)
+        self._lost |= np.isfinite(self._state.joint_age) & (silent > self.restart_time)
+        self._sensed = start
         r["state.time"][0], r["state.imu_age"][0] = self._state.time, self._state.imu_age
         r["timing.read"][0] = self.clock.now() - start
         self.states.write(self.record)

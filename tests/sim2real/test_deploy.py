@@ -53,7 +53,7 @@ WRONG = {
     "bad script": (["--robot", "g1", "--policy", "POLICY", "--script", "stand"], "expected LABEL:SECONDS"),
     "both": (["--robot", "g1", "--policy", "POLICY", "--skill", "stand", "--script", "stand:1"], "expected one"),
     "unknown skills": (["--robot", "g1", "--skills", "basic"], "no skills 'basic' (did you mean 'basics'?)"),
-    "no skills": (["--robot", "bench"], "give a policy with --policy FILE.onnx"),
+    "no skills": (["--robot", "t1"], "give a policy with --policy FILE.onnx"),
     "skills and policy": (["--robot", "g1", "--skills", "basics", "--policy", "POLICY"], "expected one"),
     "sightings": (["--robot", "g1", "--sightings", "0.0.0.0:1"], "its own camera"),
     "no address": (["--robot", "g1", "--hardware", "--operator", "keyboard", "--sightings", "x"], "expected HOST:PORT"),

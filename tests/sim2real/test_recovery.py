@@ -53,7 +53,7 @@ class Run:
             due = self.schedule.wait()
             self.wish["skill"], self.wish["arm"] = -1, arm
             self.wishes.write(self.wish)
-            self.request["command.time"] = self.clock.now()
+            self.request["command.time"], self.request["command.object_time"] = self.clock.now(), np.inf
             command.joint_pos[:], command.kp[:], command.kd[:] = self.config.home_pos, 30.0, 1.0
             self.requests.write(self.request)
             self.guardian.tick(due)
