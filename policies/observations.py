@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from policies.gait import Gait
+
 
 class Signals(NamedTuple):
     """All that an observation may be made of, each (N, size): what was measured, and where the formulas have got to."""
@@ -53,7 +55,7 @@ TERMS: dict[str, Term] = {
     "skill": Term(1.0, "same", lambda s: s.skill),
     "phase": Term(1.0, "same", lambda s: _circle(s.phase)),
     "command": Term(1.0, "command", lambda s: s.command),
-    "gait": Term(1.0, "gait", lambda s: torch.where((s.gait == 0.0) | (s.gait == 0.5), 0.0, _circle(s.gait))),
+    "gait": Term(1.0, "gait", lambda s: torch.where(Gait.resting(s.gait), 0.0, _circle(s.gait))),
     "reference": Term(1.0, "joints", lambda s: s.reference - s.home),
 }
 

@@ -138,6 +138,7 @@ class Training:
             ) from None
         for group in self.ppo.optimizer.param_groups:  # the other run's came with its optimiser
             group["lr"] = self.config.learning_rate
+        self.ppo.learning_rate = self.config.learning_rate
 
     def _save(self, name: str) -> None:
         state = {
