@@ -20,6 +20,7 @@ from drivers.sim.serial_pty import bus_of
 from sim2real.clock import MonotonicClock
 
 SERVOS, BAUD, FAULT_AT = 20, 4_000_000, 6.0  # bit/s, s after the servos started
+REST = 0.01  # s before a timed cycle, else answers to the one before, late on a busy machine, would shorten it
 FACTOR, LOSS = 8.0, 2e-3  # less CPU than the SDK; s of a cycle that a lost answer may cost
 Cycle = Callable[[], Any]
 
@@ -35,7 +36,7 @@ def rows() -> Iterator[Row]:
     with port("--no-fast") as whole, port("--no-fast", "--fault", f"drop:servos/servo_10@{FAULT_AT}") as lossy:
         cycles = [host(whole), sdk(whole), host(lossy), sdk(lossy)]
         sleep(FAULT_AT)
-        ours, theirs, ours_lost, theirs_lost = measured(cycles, perf_counter, 5)
+        ours, theirs, ours_lost, theirs_lost = measured(cycles, perf_counter, 5, REST)
         heard = max(cycles[2]() for _ in range(9))
     cost, sdk_cost = ours_lost - ours, theirs_lost - theirs
     what = f"dynamixel: a lost answer, {heard} of {SERVOS} servos heard, cycle longer by"
@@ -55,10 +56,11 @@ def port(*options: str) -> Iterator[str]:
             server.terminate()
 
 
-def measured(cycles: list[Cycle], clock: Callable[[], float], blocks: int) -> list[float]:
+def measured(cycles: list[Cycle], clock: Callable[[], float], blocks: int, rest: float = 0.0) -> list[float]:
     """Least seconds of each cycle, in interleaved blocks of ten: others on this machine only ever make it slower."""
     times = np.zeros((len(cycles), blocks, 10))
     for block, k, i in np.ndindex(blocks, len(cycles), 10):
+        sleep(rest)
         start = clock()
         cycles[k]()
         times[k, block, i] = clock() - start
@@ -73,12 +75,13 @@ def host(path: str) -> Cycle:
     command = MotorCommand(*np.zeros((5, SERVOS)))
 
     def cycle() -> int:
+        state = servos.read(clock.now())  # what came late
         began = clock.now()
         servos.write(command)
         while (left := servos.waiting) > 0.0:
             select.select([wire], [], [], left)
-            servos.read(clock.now())
-        return int(np.count_nonzero(servos.read(clock.now()).time > began))
+            state = servos.read(clock.now())
+        return int(np.count_nonzero(state.time > began))
 
     return cycle
 
