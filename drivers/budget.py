@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -84,12 +85,15 @@ def bits_of(spec: BusSpec) -> Callable[[np.ndarray], np.ndarray]:
 
 # A standard frame with 8 bytes has 98 bits from the start to the end of the CRC: 7 chunks of 14. The state between two
 # chunks is the last bit and how many like it came in a row (1 to 4; the fifth is followed by a stuff bit at once), and
-# one table of 8 states x 2^14 chunks tells the next state and the stuff bits. Before the frame: a 1, once.
+# tables of 8 states x 2^14 chunks tell the next state and the stuff bits. Before the frame: a 1, once.
 CHUNK_BITS = 14
 CHUNK = 1 << CHUNK_BITS
+MASK = CHUNK - 1
 EXTENDED_SHIFT = 29  # of the flags in ``id``
 START = 4 * CHUNK  # state (1, once)
-_SHIFTS = np.array([55, 41, 27, 13], np.uint64)[:, None]  # of the payload, for chunks 1 to 4
+# What of the payload is in chunks 1 to 5: 9 bits, 14, 14, 14 and 13.
+_SHIFTS = np.array([55, 41, 27, 13, 0])[:, None]
+_MASKS = np.array([0x1FF, MASK, MASK, MASK, 0x1FFF])[:, None]
 
 
 def frame_bits(frames: np.ndarray) -> np.ndarray:
@@ -112,56 +116,49 @@ def frame_bits(frames: np.ndarray) -> np.ndarray:
 
 def _plain_bits(ids: np.ndarray, data: np.ndarray) -> np.ndarray:
     """The same for standard data frames with 8 bytes: identifiers (n,), payloads (n, 8) uint8."""
-    stuffing, crc_of = _tables()
-    words = words_of(data)
     chunks = np.empty((7, len(ids)), np.int64)
-    chunks[0] = ids
-    chunks[0] <<= 2  # start, identifier, remote and format flags, length 8 = 01000 from here on
-    chunks[1:5] = words >> _SHIFTS & np.uint64(CHUNK - 1)
-    chunks[1] = chunks[1] & 0x1FF | 0b01000 << 9
-    chunks[5] = (words & np.uint64(0x1FFF)) << np.uint64(1)
-    crc = np.bitwise_xor.reduce(crc_of.take(chunks[:6] + _CRC_OFFSETS), axis=0)
+    np.multiply(ids, 4, out=chunks[0])  # start, identifier, remote and format flags, length 8 = 01000 from here on
+    payload = chunks[1:6]
+    np.right_shift(words_of(data).view(np.int64), _SHIFTS, out=payload)
+    payload &= _MASKS
+    chunks[1] |= 0b01000 << 9
+    chunks[5] <<= 1
+    crc = np.bitwise_xor.reduce(_crc().take(chunks[:6] + _CRC_OFFSETS), axis=0)
     chunks[5] |= crc >> CHUNK_BITS
-    chunks[6] = crc & (CHUNK - 1)
-
-    entries = np.empty_like(chunks)
-    state: np.ndarray | int = START
-    for chunk, entry in zip(chunks, entries, strict=True):
-        stuffing.take(chunk | state, out=entry, mode="clip")  # never out of range; "raise" would copy twice
-        state = entry & -CHUNK
-    return (entries & (CHUNK - 1)).sum(axis=0) + (7 * CHUNK_BITS + TAIL_BITS)
+    np.bitwise_and(crc, MASK, out=chunks[6])
+    return _stuff_bits(chunks) + (7 * CHUNK_BITS + TAIL_BITS)
 
 
 def _extended_bits(ids: np.ndarray, data: np.ndarray) -> np.ndarray:
     """The same for extended data frames with 8 bytes: 118 bits, 8 chunks and 6 bits, which are filled up with bits that
     take turns and so need no stuffing."""
-    stuffing, crc_of = _tables()[0], _extended_crc()
     id = ids.astype(np.int64) & 0x1FFF_FFFF
     head = (
         (id >> 18 << 2 | 0b11) << 18 | id & 0x3FFFF
     ) << 7 | 0b000_1000  # start, 11, SRR, IDE, 18, RTR, r1, r0, length
-    words = words_of(data)
-    word = words.view(np.int64)
-    mask = CHUNK - 1
-    tail = [word >> shift & mask for shift in (0, 14, 28, 42)]
-    tail += [(head << 8 | (word >> 56 & 0xFF)) & mask, head >> 6 & mask, head >> 20 & mask, head >> 34]
-    crc = np.bitwise_xor.reduce(crc_of.take(np.array(tail) + _EXTENDED_OFFSETS), axis=0)
+    word = words_of(data).view(np.int64)
+    tail = [word >> shift & MASK for shift in (0, 14, 28, 42)]
+    tail += [(head << 8 | (word >> 56 & 0xFF)) & MASK, head >> 6 & MASK, head >> 20 & MASK, head >> 34]
+    crc = np.bitwise_xor.reduce(_extended_crc().take(np.array(tail) + _EXTENDED_OFFSETS), axis=0)
     end = crc & 0x3F
     chunks = [
         head >> 25,
-        head >> 11 & mask,
+        head >> 11 & MASK,
         (head & 0x7FF) << 3 | (word >> 61 & 0b111),
-        *(word >> shift & mask for shift in (47, 33, 19, 5)),
+        *(word >> shift & MASK for shift in (47, 33, 19, 5)),
         (word & 0x1F) << 9 | crc >> 6,
         end << 8 | np.where(end & 1, 0x55, 0xAA),
     ]
-    total = np.full(len(ids), 118 + TAIL_BITS)
-    state: np.ndarray | int = START
-    for chunk in chunks:
-        entry = stuffing.take(chunk | state)
-        state = entry & -CHUNK
-        total += entry & mask
-    return total
+    return _stuff_bits(np.array(chunks)) + (118 + TAIL_BITS)
+
+
+def _stuff_bits(chunks: np.ndarray) -> np.ndarray:
+    """(n,) int64 stuff bits in ``chunks`` (k, n) that follow each other; they are overwritten."""
+    following, stuffed = _stuffing()
+    chunks[0] |= START
+    for before, chunk in pairwise(chunks):
+        chunk |= following.take(before)
+    return np.add.reduce(stuffed.take(chunks), axis=0, dtype=np.int64)
 
 
 _CRC_OFFSETS = (np.arange(6) * CHUNK)[:, None]
@@ -185,11 +182,8 @@ def _extended_crc() -> np.ndarray:
 
 
 @cache
-def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """(8 * CHUNK,) next state * CHUNK + stuff bits, at state * CHUNK + chunk; and (6 * CHUNK,) the CRC of each chunk.
-
-    The CRC starts at 0 and is linear over GF(2): that of a frame is the exclusive or of those of its chunks.
-    """
+def _stuffing() -> tuple[np.ndarray, np.ndarray]:
+    """(8 * CHUNK,) next state * CHUNK, and (8 * CHUNK,) stuff bits, at state * CHUNK + chunk."""
     state, chunk = np.divmod(np.arange(8 * CHUNK), CHUNK)
     last, run = np.divmod(state, 4)
     run += 1
@@ -201,8 +195,15 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
         stuffed += full
         last = np.where(full, 1 - bit, bit)
         run[full] = 1
-    stuffing = (last * 4 + run - 1) * CHUNK + stuffed
+    return (last * 4 + run - 1) * CHUNK, stuffed.astype(np.uint8)
 
+
+@cache
+def _crc() -> np.ndarray:
+    """(6 * CHUNK,) the CRC of each chunk of a standard frame.
+
+    The CRC starts at 0 and is linear over GF(2): that of a frame is the exclusive or of those of its chunks.
+    """
     contribution = [CRC_POLYNOMIAL]  # of the last of the 83 bits, then of the one before it, ...
     while len(contribution) < 83:
         contribution.append(_crc_step(contribution[-1], 0))
@@ -212,7 +213,7 @@ def _tables() -> tuple[np.ndarray, np.ndarray]:
     for k in range(6):
         for b in range(CHUNK_BITS):
             crc_of[k] ^= np.where(chunk >> b & 1, contribution[(5 - k) * CHUNK_BITS + b], 0)
-    return stuffing, crc_of.reshape(-1)
+    return crc_of.reshape(-1)
 
 
 @lru_cache(4096)  # short frames are questions and their answers, and these repeat themselves

@@ -322,7 +322,10 @@ class CanBuses:
             except BusError as error:
                 failures.append(error)
                 arrived.append(NOTHING)
-        whole = self._codec.unpack_whole(np.concatenate(arrived), self._state, now)
+        frames = np.frombuffer(
+            b"".join([f.tobytes() for f in arrived]), FRAME
+        )  # np.concatenate takes ten times as long
+        whole = self._codec.unpack_whole(frames, self._state, now)
         for bus, frames in zip(self._buses, arrived, strict=True):
             if whole:
                 bus.counters.received += len(frames)

@@ -32,6 +32,10 @@ class Robot:
         self._sign = np.array([m.sign for m in motors], float)[self._motor_of_joint]
         self._offset = np.array([m.offset for m in motors], float)[self._motor_of_joint]
         self._joint_of_motor = joint_of_motor
+        # Motors in the order of the joints need no sorting: a slice is a view where indices make a copy.
+        ordered = bool((joint_of_motor == np.arange(len(motors))).all())
+        self._to_joints = slice(None) if ordered else self._motor_of_joint
+        self._to_motors = slice(None) if ordered else joint_of_motor
         self._motor_sign = np.array([m.sign for m in motors], float)
         self._motor_offset = np.array([m.offset for m in motors], float)
         self._parts, sizes = zip(*joined(self.buses), strict=True)  # each read and written in one call
@@ -65,7 +69,7 @@ class Robot:
         """
         states = self._states
         failure = _each(self._parts, lambda bus, i: states.__setitem__(i, bus.read(now)))
-        order = self._motor_of_joint
+        order = self._to_joints
         state.time = now
         motors = states[0] if len(states) == 1 else MotorState.concatenate(states)
         np.subtract(motors.position[order], self._offset, out=state.joint_pos)
@@ -94,7 +98,7 @@ class Robot:
 
     def write(self, command: JointCommand) -> None:
         """Send one tick of joint targets. Raises BusError when a wire is gone (the other buses are still written)."""
-        of = self._joint_of_motor
+        of = self._to_motors
         sign = self._motor_sign
         c = self._command
         np.add(command.joint_pos[of] * sign, self._motor_offset, out=c[0])

@@ -65,7 +65,7 @@ class Measures:
         self._load = np.zeros(len(wiring.buses))
         self._faults: list[str] = []
         self._fault = 0
-        self._last: dict[str, Any] = {}
+        self._ticks = self._late = self._lost = self._policy_ticks = self._policy_late = 0
         self._start: tuple[np.ndarray, float] | None = None
         self._end: np.ndarray | None = None
         self._sum = np.zeros(3)
@@ -87,10 +87,10 @@ class Measures:
             joint = int(r["fault_joint"][0])
             self._faults.append(f"S2R-{fault:03d}" + (f" {self._config.joint_names[joint]}" if joint >= 0 else ""))
         self._fault = fault
-        self._last |= {"ticks": int(r["tick"][0]) + 1, "late": int(r["late"][0]), "lost": int(r["bus.lost"].sum())}
+        self._ticks, self._late, self._lost = int(r["tick"][0]) + 1, int(r["late"][0]), sum(r["bus.lost"][0].tolist())
 
     def observe(self, world: Any, tick: np.ndarray, pilot: np.ndarray, since: float) -> None:
-        self._last["policy_ticks"], self._last["policy_late"] = int(pilot["tick"][0]) + 1, int(pilot["late"][0])
+        self._policy_ticks, self._policy_late = int(pilot["tick"][0]) + 1, int(pilot["late"][0])
         if since < 0 or tick["mode"][0] not in (Mode.RUN, Mode.HOLD):
             return
         truth = world.truth()
@@ -118,10 +118,10 @@ class Measures:
         out = Summary(
             robot=self._config.name,
             duration=self._since,
-            ticks=self._last.get("ticks", 0),
-            late_ticks=self._last.get("late", 0),
-            policy_ticks=self._last.get("policy_ticks", 0),
-            late_policy_ticks=self._last.get("policy_late", 0),
+            ticks=self._ticks,
+            late_ticks=self._late,
+            policy_ticks=self._policy_ticks,
+            late_policy_ticks=self._policy_late,
             faults=self._faults,
             refused_skills=[f"{r.skill}: {r.reason}" for r in player.refusals],
             messages=list(messages),
@@ -133,7 +133,7 @@ class Measures:
             temperature_max=float(self._temperature[hot]) if measured else None,
             temperature_max_of=names[hot] if measured else "",
             bus_load_max=float(self._load.max()),
-            frames_lost=self._last.get("lost", 0),
+            frames_lost=self._lost,
             **more,
         )
         if self._seen_body and self._start is not None and self._end is not None:

@@ -20,7 +20,6 @@ from drivers.sim.serial_pty import bus_of
 from sim2real.clock import MonotonicClock
 
 SERVOS, BAUD, FAULT_AT = 20, 4_000_000, 6.0  # bit/s, s after the servos started
-REST = 0.01  # s before a timed cycle, else answers to the one before, late on a busy machine, would shorten it
 FACTOR, LOSS = 8.0, 2e-3  # less CPU than the SDK; s of a cycle that a lost answer may cost
 Cycle = Callable[[], Any]
 
@@ -36,9 +35,8 @@ def rows() -> Iterator[Row]:
     with port("--no-fast") as whole, port("--no-fast", "--fault", f"drop:servos/servo_10@{FAULT_AT}") as lossy:
         cycles = [host(whole), sdk(whole), host(lossy), sdk(lossy)]
         sleep(FAULT_AT)
-        ours, theirs, ours_lost, theirs_lost = measured(cycles, perf_counter, 5, REST)
+        cost, sdk_cost = np.diff(np.reshape(measured(cycles, perf_counter, 5, 0.01), (2, 2)), axis=0)[0].tolist()
         heard = max(cycles[2]() for _ in range(9))
-    cost, sdk_cost = ours_lost - ours, theirs_lost - theirs
     what = f"dynamixel: a lost answer, {heard} of {SERVOS} servos heard, cycle longer by"
     yield Row(what, f"{cost * 1e3:.2f} ms", f"{sdk_cost * 1e3:.0f} ms dynamixel-sdk, the rest dropped", "", "< 2 ms",
               cost < LOSS and heard == SERVOS - 1, {"seconds": {"ours": cost, "sdk": sdk_cost}})  # fmt: skip
@@ -60,7 +58,7 @@ def measured(cycles: list[Cycle], clock: Callable[[], float], blocks: int, rest:
     """Least seconds of each cycle, in interleaved blocks of ten: others on this machine only ever make it slower."""
     times = np.zeros((len(cycles), blocks, 10))
     for block, k, i in np.ndindex(blocks, len(cycles), 10):
-        sleep(rest)
+        sleep(rest)  # s, for answers that a busy machine brings late: the next cycle would take them for its own
         start = clock()
         cycles[k]()
         times[k, block, i] = clock() - start
@@ -75,13 +73,12 @@ def host(path: str) -> Cycle:
     command = MotorCommand(*np.zeros((5, SERVOS)))
 
     def cycle() -> int:
-        state = servos.read(clock.now())  # what came late
-        began = clock.now()
+        servos.read(began := clock.now())  # what came late
         servos.write(command)
         while (left := servos.waiting) > 0.0:
             select.select([wire], [], [], left)
-            state = servos.read(clock.now())
-        return int(np.count_nonzero(state.time > began))
+            servos.read(clock.now())
+        return int(np.count_nonzero(servos.read(clock.now()).time > began))
 
     return cycle
 

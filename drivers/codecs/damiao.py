@@ -204,13 +204,15 @@ class DamiaoTick:
         """Raises BusError for an unknown model."""
         self.mit = MitCodec(ranges_of(motors))
         self._ids = np.array([m.id for m in motors], np.uint32)
+        self._commands = make_frames(self._ids, np.zeros((len(motors), 8), np.uint8))
         self._nibbles = (self._ids & 0xF).astype(np.uint8)
         self._feedback_ids = np.array([m.feedback_id for m in motors], np.uint32)
 
     def pack_command(self, command: MotorCommand) -> np.ndarray:
         """One MIT command for each motor (FRAME, (n,)). Saturates; raises ValueError for a value not finite."""
-        c = command
-        return make_frames(self._ids, self.mit.pack_command(c.position, c.velocity, c.kp, c.kd, c.torque))
+        c, frames = command, self._commands.copy()
+        frames["data"] = self.mit.pack_command(c.position, c.velocity, c.kp, c.kd, c.torque)
+        return frames
 
     def unpack_whole(self, frames: np.ndarray, state: MotorState, now: float) -> bool:
         """Put ``frames`` into ``state`` if they are feedback of every motor in turn, as in nearly every tick."""
@@ -370,6 +372,8 @@ class DamiaoMotors:
         self.mit = MitCodec(ranges or ranges_of(spec.motors))
         self.ids = np.array([m.id for m in spec.motors], np.uint32)
         self.feedback_ids = np.array([m.feedback_id for m in spec.motors], np.uint32)
+        self._feedback = make_frames(self.feedback_ids, np.zeros((len(self.ids), 8), np.uint8))
+        self._nibbles = self.ids.astype(np.int64) & 0xF
         self._row_of = _row_of(self.ids)
         if hears is not None:
             self._row_of[self.ids] = -1
@@ -412,9 +416,11 @@ class DamiaoMotors:
     ) -> np.ndarray:
         """Feedback frames (FRAME, (n,)) of every motor: rad, rad/s, N m, a key of ERRORS, deg C. ``wrap``: what a
         position out of range does (MitCodec.pack_feedback; which of the two a Damiao does is not verified)."""
-        byte0 = np.asarray(error) << 4 | self.ids.astype(np.int64) & 0xF
-        data = self.mit.pack_feedback(position, velocity, torque, byte0, driver_temperature, rotor_temperature, wrap)
-        return make_frames(self.feedback_ids, data)
+        byte0, frames = np.asarray(error) << 4 | self._nibbles, self._feedback.copy()
+        frames["data"] = self.mit.pack_feedback(
+            position, velocity, torque, byte0, driver_temperature, rotor_temperature, wrap
+        )
+        return frames
 
     def pack_register(self, row: int, operation: int, register: str, value: float | int) -> np.ndarray:
         """One motor's answer on the register channel: one FRAME, shape (1,)."""

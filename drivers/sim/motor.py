@@ -123,6 +123,7 @@ class SimMotors:
         self._rated = np.ones(n)  # N m
         self._rotor_limit = np.full(n, ROTOR_LIMIT)
         self._effect = np.zeros(n, np.int64)
+        self._signs = b""  # of the law, that it follows from; empty: it has changed since
         self.frame = frame_type(buses[0].data_bitrate)
         self._last = np.zeros(n, self.frame)  # the last command of each
         self._commanded = np.zeros(n, bool)  # since it was enabled
@@ -135,8 +136,7 @@ class SimMotors:
         self._shortest = np.inf  # s, of all watchdogs
         self._thermal_due = THERMAL_PERIOD
         self._stale = True
-        self._feedback = b""
-        self._bits: list[int] = []
+        self._answers: list[Answer] = []  # the feedback of each in this substep
         self._keys: list[int] = []
         self._registers = [dict(r) for r in self._flash]
         self._configure()
@@ -163,8 +163,8 @@ class SimMotors:
         """The feedback (FRAME, (n,)) of every motor."""
         raise NotImplementedError
 
-    def _obey(self, rows: list[int], frames: np.ndarray) -> None:
-        """Take over the commands ``frames`` (FRAME, (m,)) to motors ``rows``, in their order."""
+    def _obey(self, rows: np.ndarray, frames: np.ndarray) -> None:
+        """Take over the commands ``frames`` (FRAME, (m,)) to motors ``rows`` (m,), in their order."""
         self._last[rows] = frames
 
     def _targets(self) -> MotorCommand:
@@ -193,8 +193,7 @@ class SimMotors:
         """The feedback of one motor."""
         if self._stale:
             self.refresh()
-        size = self.frame.itemsize
-        return row, self._keys[row], self._feedback[size * row : size * row + size], self._bits[row]
+        return self._answers[row]
 
     def _say(self, row: int, frame: np.ndarray) -> Answer:
         """Any other answer (FRAME, (1,)) of one motor."""
@@ -205,10 +204,11 @@ class SimMotors:
         if not self._stale:
             return self._frame_bits(np.frombuffer(raw, self.frame)).tolist() if raw else []
         self._stale = False
-        self._feedback = self._pack_feedback().tobytes()
-        bits = self._frame_bits(np.frombuffer(raw + self._feedback, self.frame)).tolist()
-        self._bits = bits[-len(self.specs) :]
-        return bits[: -len(self.specs)]
+        feedback, size, n = self._pack_feedback().tobytes(), self.frame.itemsize, len(self.specs)
+        bits = self._frame_bits(np.frombuffer(raw + feedback, self.frame)).tolist()
+        raws = [feedback[at : at + size] for at in range(0, size * n, size)]
+        self._answers = list(zip(range(n), self._keys, raws, bits[-n:], strict=True))
+        return bits[:-n]
 
     @property
     def position(self) -> np.ndarray:
@@ -238,15 +238,16 @@ class SimMotors:
         """The commands that arrived become the motors' targets."""
         if not self._arrived:
             return
-        rows, raws, times = map(list, zip(*self._arrived, strict=True))
+        told, raws, when = zip(*self._arrived, strict=True)
         self._arrived.clear()
+        rows, times = np.array(told), np.array(when)
         self._obey(rows, np.frombuffer(b"".join(raws), self.frame))
         self.last_command_time[rows] = times
         self._fed[rows] = times
         self._commanded[rows] = True
         self._since[rows] = times
         self._changed = True
-        self._deadline = min(self._deadline, min(times) + self._shortest)
+        self._deadline = min(self._deadline, min(when) + self._shortest)
 
     def _decide(self) -> np.ndarray:
         """The law (3, n) that the motors' targets and states make: bias, kp, kd at the joints."""
@@ -254,13 +255,19 @@ class SimMotors:
         on = self.enabled & self._commanded
         bias = c.kp * (c.position - self._offset + self.zero) + c.kd * c.velocity + c.torque
         law = np.array([self._sign * bias, c.kp, c.kd]) * on
-        effect = np.where(law[1] > 0, DRIVING, np.where(law[2] > 0, DAMPING, LIMP)) * on
-        if (effect != self._effect).any():
-            for row in np.flatnonzero(effect != self._effect):
-                if effect[row] != OFF:
-                    self._note(float(self.last_command_time[row]), int(row), EFFECTS[effect[row]])
-            self._effect = effect
+        signs = on.tobytes() + (law[1:] > 0).tobytes()
+        if signs != self._signs:
+            self._signs = signs
+            self._tell_effects(law, on)
         return law
+
+    def _tell_effects(self, law: np.ndarray, on: np.ndarray) -> None:
+        """Note whose command has another effect than the one before."""
+        effect = np.where(law[1] > 0, DRIVING, np.where(law[2] > 0, DAMPING, LIMP)) * on
+        for row in np.flatnonzero(effect != self._effect):
+            if effect[row] != OFF:
+                self._note(float(self.last_command_time[row]), int(row), EFFECTS[effect[row]])
+        self._effect = effect
 
     def _expire(self, now: float) -> None:
         """Watchdogs whose time is up trip."""
@@ -327,6 +334,7 @@ class SimMotors:
         if not on:
             self._arrived = [a for a in self._arrived if a[0] != row]
             self._effect[row] = OFF
+            self._signs = b""
             self._changed = True
         self._note(time, row, event)
         self._set_deadline()

@@ -89,7 +89,7 @@ class SimRecoil(SimMotors):
             if self.mode[row] in DRIVING_MODES:
                 self._arrived.append((row, raw, time))
             else:
-                self._obey([row], frame[None])
+                self._obey(np.array([row]), frame[None])
             return answer
         self._take_commands()  # what came before counts before
         if function == Function.RPDO1:
@@ -157,7 +157,7 @@ class SimRecoil(SimMotors):
         self._changed = True
         self._set_deadline()
 
-    def _obey(self, rows: list[int], frames: np.ndarray) -> None:
+    def _obey(self, rows: np.ndarray, frames: np.ndarray) -> None:
         for row, frame in zip(rows, frames, strict=True):
             first, second = self._codec.unpack_targets(frame)
             if not np.isfinite([first, second]).all():

@@ -95,7 +95,7 @@ class SimCan:
         self._motors, self._latency, self._reply_delay, self._room = motors, latency, reply_delay, queue_length
         self._bit = 1.0 / spec.bitrate
         self._queue: deque[tuple] = deque()  # the host's: (ready, key, id, raw, bits, tries)
-        self._waiting: deque[tuple] = deque()  # answers to come, sorted: (ready, key, order, raw, bits, row, tries)
+        self._waiting: deque[tuple] = deque()  # answers to come, sorted: (ready, as in ``_contending``)
         self._contending: list[tuple] = []  # heap of answers that want the wire: (key, order, raw, bits, row, tries)
         self._free = 0.0  # when the wire is idle again
         self._order = 0
@@ -157,7 +157,7 @@ class SimCan:
         """A motor wants to send a frame (row, key, raw frame, bits) from ``ready`` on, without having been asked."""
         row, key, raw, bits = answer
         self._order += 1
-        insort(self._waiting, (ready, key, self._order, raw, bits, row, 0))
+        insort(self._waiting, (ready, (key, self._order, raw, bits, row, 0)))
 
     @property
     def busy(self) -> bool:
@@ -188,7 +188,7 @@ class SimCan:
             if start >= until:
                 return
             while waiting and waiting[0][0] <= start:
-                heappush(contending, waiting.popleft()[1:])
+                heappush(contending, waiting.popleft()[1])
             self._free = start
             if queue and queue[0][0] <= start and (not contending or queue[0][1] < contending[0][0]):
                 _, _, id, raw, bits, tries = queue[0]
@@ -210,17 +210,17 @@ class SimCan:
                     if answer is not None:
                         row, key, reply, bits = answer
                         self._order += 1
-                        item = (end + delay, key, self._order, reply, bits, row, 0)
+                        item = (end + delay, (key, self._order, reply, bits, row, 0))
                         if waiting and waiting[-1] > item:  # behind one that a fault holds back
                             insort(waiting, item)
                         else:
                             waiting.append(item)
             else:
-                _, _, raw, bits, row, tries = contending[0]
+                key, _, raw, bits, row, tries = contending[0]
                 end = start + bits * bit
                 if end > until:
                     return
-                key, order, raw, bits, row, tries = heappop(contending)
+                heappop(contending)
                 if not powered[row]:
                     continue
                 copies = 1
@@ -310,12 +310,12 @@ class SimCan:
             elif fault.kind == "duplicate":
                 copies = 2
             elif fault.kind == "delay" and tries == 0:
-                insort(self._waiting, (start + fault.value, key, self._order, raw, bits, row, 1))
+                insort(self._waiting, (start + fault.value, (key, self._order, raw, bits, row, 1)))
                 return None, raw
             elif fault.kind == "corrupt":
                 self._break_off(start, bits)
                 if tries < BUS_OFF_TRIES:
-                    insort(self._waiting, (self._free, key, self._order, raw, bits, row, tries + 1))
+                    insort(self._waiting, (self._free, (key, self._order, raw, bits, row, tries + 1)))
                 return None, raw
             elif fault.kind in FEEDBACK:
                 raw = self._lie(fault, row, raw)
@@ -339,7 +339,7 @@ class SimCan:
 
     def forget(self, row: int) -> None:
         """A motor lost its power: what it wanted to say is gone."""
-        self._waiting = deque(w for w in self._waiting if w[5] != row)
+        self._waiting = deque(w for w in self._waiting if w[1][4] != row)
         self._contending = [c for c in self._contending if c[4] != row]
         heapify(self._contending)
 
