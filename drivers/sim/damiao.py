@@ -49,9 +49,9 @@ class SimDamiao(SimMotors):
 
     def receive(self, bus: int, id: int, raw: bytes, time: float) -> Answer | None:
         row = self._rows[bus].get(id)
-        if row is None or raw[8:15] == MAGIC_PREFIX or raw[4] != 8:
+        if row is None or (raw[8] == 0xFF and raw[8:15] == MAGIC_PREFIX) or raw[4] != 8:
             return self._receive_rare(bus, raw, time)
-        if not (self.powered[row] and self._obeys_mit[row]):
+        if not self._obeys_mit[row]:
             return None
         answer = self._answer(row)
         if self._accepts[row]:

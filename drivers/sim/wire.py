@@ -16,6 +16,7 @@ from bisect import insort
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from heapq import heapify, heappop, heappush
 from typing import Protocol
 
@@ -63,6 +64,7 @@ class Traffic:
     bus_off: int = 0  # how often the host's controller left the bus
 
 
+@lru_cache(4096)
 def priority(id: int) -> int:
     """Arbitration key of an identifier, the lowest wins: base identifier first, and a standard frame before an extended
     one with the same base (ISO 11898-1)."""
@@ -150,8 +152,8 @@ class SimCan:
     def take(self, ready: float, raw: bytes, ids: Iterable[int], bits: Iterable[int]) -> None:
         """Frames of the host, whose length on the wire is now known, enter its controller's queue."""
         size = self.frame.itemsize
-        for i, (id, n) in enumerate(zip(ids, bits, strict=True)):
-            self._queue.append((ready, priority(id), id, raw[size * i : size * i + size], n, 0))
+        raws = [raw[at : at + size] for at in range(0, len(raw), size)]
+        self._queue += [(ready, priority(id), id, r, n, 0) for id, r, n in zip(ids, raws, bits, strict=True)]
 
     def say(self, ready: float, answer: tuple[int, int, bytes, int]) -> None:
         """A motor wants to send a frame (row, key, raw frame, bits) from ``ready`` on, without having been asked."""
@@ -177,8 +179,9 @@ class SimCan:
         if (self._host_faults or self._away_until > self._free or not all(powered)) and self._stalls(until):
             return
         traffic, carried, inbox, latency = self.traffic, self.carried, self.inbox, self._latency
+        free = self._free
         while True:
-            start = self._free
+            start = free
             if not contending:
                 first = queue[0][0] if queue else until
                 if waiting and waiting[0][0] < first:
@@ -186,31 +189,31 @@ class SimCan:
                 if first > start:
                     start = first
             if start >= until:
-                return
+                break
+            free = start
             while waiting and waiting[0][0] <= start:
                 heappush(contending, waiting.popleft()[1])
-            self._free = start
+            copies = 1
             if queue and queue[0][0] <= start and (not contending or queue[0][1] < contending[0][0]):
                 _, _, id, raw, bits, tries = queue[0]
                 end = start + bits * bit
                 if end > until:
-                    return
+                    break
                 queue.popleft()
-                copies = self._spoil_command(faults, start, id, raw, bits, tries) if faults else 1
-                if copies is None:
-                    continue
-                self._free = end
-                traffic.busy += end - start
-                traffic.frames += 1
-                carried.append(raw)
+                if faults:
+                    copies = self._spoil_command(faults, start, id, raw, bits, tries)
+                    if copies is None:
+                        free = max(start, self._free)
+                        continue
                 if self._errors:
                     self._errors -= 1
-                for _ in range(copies):
+                while copies:
+                    copies -= 1
                     answer = receive(bus, id, raw, end)
                     if answer is not None:
-                        row, key, reply, bits = answer
+                        row, key, reply, length = answer
                         self._order += 1
-                        item = (end + delay, (key, self._order, reply, bits, row, 0))
+                        item = (end + delay, (key, self._order, reply, length, row, 0))
                         if waiting and waiting[-1] > item:  # behind one that a fault holds back
                             insort(waiting, item)
                         else:
@@ -219,21 +222,23 @@ class SimCan:
                 key, _, raw, bits, row, tries = contending[0]
                 end = start + bits * bit
                 if end > until:
-                    return
+                    break
                 heappop(contending)
                 if not powered[row]:
                     continue
-                copies = 1
                 if faults:
                     copies, raw = self._spoil_feedback(faults, start, key, raw, bits, row, tries)
                     if copies is None:
+                        free = max(start, self._free)
                         continue
-                self._free = end
-                traffic.busy += end - start
-                traffic.frames += 1
-                carried.append(raw)
-                for _ in range(copies):
+                while copies:
+                    copies -= 1
                     inbox.append((end + latency, raw))
+            free = end
+            carried.append(raw)
+            traffic.busy += end - start
+            traffic.frames += 1
+        self._free = free
 
     def away(self, now: float) -> bool:
         """Whether the host's controller is off the bus."""

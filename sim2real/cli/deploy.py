@@ -236,15 +236,15 @@ def _lockstep(args, config, player, policies, operator, record, console):
             ) from None
         camera = Camera(args.video, args.visuals)
     from sim2real.clock import MonotonicClock
-    from sim2real.recorder.process import Direct
+    from sim2real.recorder.process import Recorder
     from sim2real.simulation import Scene, Simulation
 
-    sink = None
+    recorder = None
 
     def sink_for(layouts):
-        nonlocal sink
-        sink = Direct(record, layouts, *_about(args, config, policies))
-        return sink
+        nonlocal recorder
+        recorder = Recorder(record, layouts, *_about(args, config, policies), patient=True)
+        return recorder.sink
 
     simulation = Simulation(
         config,
@@ -260,10 +260,10 @@ def _lockstep(args, config, player, policies, operator, record, console):
     try:
         summary = simulation.run()
     finally:
-        if sink is not None:
-            sink.close()
+        if recorder is not None:
+            recorder.close()
     summary.real_time_factor = simulation.elapsed / (MonotonicClock.now() - began)
-    if sink is not None:
+    if recorder is not None:
         summary.record = str(record)
     if camera is not None:
         camera.save()

@@ -2,8 +2,8 @@
 
 ``Recorder`` owns the process; its ``sink`` goes to whoever has something to record (guardian, pilot: a Sink passes
 through ``multiprocessing``). A sink never blocks: when the channel is full the record is dropped and counted, and the
-count travels with the next one, so the file tells what it lacks. ``Direct`` offers the same without a process and
-without loss, for lockstep.
+count travels with the next one, so the file tells what it lacks. In lockstep, where time waits, so does a ``patient``
+sink, and nothing is dropped.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ FLUSH_INTERVAL = 1.0  # s, at most this much of a run is in memory when the writ
 
 
 class Sink:
-    """The sending end: ``write`` and nothing that waits. ``dropped``: records lost so far, per topic."""
+    """The sending end: ``write`` and, unless ``patient``, nothing that waits. ``dropped``: records lost so far, per topic."""
 
-    def __init__(self, channel: socket.socket, topics: int) -> None:
-        channel.setblocking(False)
+    def __init__(self, channel: socket.socket, topics: int, patient: bool = False) -> None:
+        channel.setblocking(patient)
         self._channel = channel
         self._id = os.getpid()
         self.dropped = [0] * topics
@@ -69,11 +69,12 @@ class Sink:
         self._channel.close()
 
     def __reduce__(self) -> tuple:
-        return Sink, (self._channel, len(self.dropped))
+        return Sink, (self._channel, len(self.dropped), self._channel.getblocking())
 
 
 class Recorder:
-    """Starts the writer process for one file; arguments as of ``Writer``. Raises Sim2realError if it cannot record."""
+    """Starts the writer process for one file; arguments as of ``Writer``. ``patient``: its sink waits for room rather than
+    drop a record. Raises Sim2realError if it cannot record."""
 
     def __init__(
         self,
@@ -81,10 +82,12 @@ class Recorder:
         layouts: Mapping[str, Layout],
         metadata: Mapping[str, object] | None = None,
         attachments: Mapping[str, bytes] | None = None,
+        patient: bool = False,
     ) -> None:
         self.path = Path(path).absolute()
         job = {
             "path": str(self.path),
+            "patient": patient,
             "layouts": {topic: layout_to_json(layout) for topic, layout in layouts.items()},
             "metadata": strings(metadata or {}),
             "attachments": {name: base64.b64encode(data).decode() for name, data in (attachments or {}).items()},
@@ -111,7 +114,7 @@ class Recorder:
             self._process.kill()
             self._process.wait()
             raise Sim2realError(first.get("text", f"{self.path}: the recorder did not start; see the messages above"))
-        self.sink = Sink(ours, len(layouts))
+        self.sink = Sink(ours, len(layouts), patient)
 
     @property
     def pid(self) -> int:
@@ -150,57 +153,15 @@ class Recorder:
         return json.loads(stream.readline() or "{}")
 
 
-class Direct:
-    """Recorder and Sink in one, in this process: nothing is dropped, and every ``write`` is in the file's order."""
-
-    def __init__(
-        self,
-        path: Path | str,
-        layouts: Mapping[str, Layout],
-        metadata: Mapping[str, object] | None = None,
-        attachments: Mapping[str, bytes] | None = None,
-    ) -> None:
-        self.path = Path(path).absolute()
-        self.dropped = [0] * len(layouts)
-        self._topics = list(layouts)
-        self._writer = Writer(self.path, layouts, metadata, attachments)
-        self._told = False
-
-    @property
-    def sink(self) -> Direct:
-        return self
-
-    def write(self, topic: int, time: float, record: bytes | np.ndarray) -> bool:
-        written = self._writer.write(topic, time, record)
-        self.dropped[topic] += not written
-        return written
-
-    def poll(self) -> list[str]:
-        told, self._told = self._told, bool(self._writer.stopped)
-        return [self._writer.stopped] if self._told and not told else []
-
-    def close(self, timeout: float = 10.0) -> dict[str, object]:
-        ending = _ending(self._topics, self._writer, self.dropped)
-        self._writer.finish(ending)
-        return ending
-
-
-def _ending(topics: list[str], writer: Writer, dropped: list[int]) -> dict[str, object]:
-    return {
-        "written": dict(zip(topics, writer.written, strict=True)),
-        "dropped": dict(zip(topics, dropped, strict=True)),
-        "stopped": writer.stopped,
-    }
-
-
 class _Drain:
     """The receiving end: this thread only empties the channel into memory, another one writes to the disk."""
 
-    def __init__(self, channel: socket.socket, writer: Writer, topics: list[str]) -> None:
+    def __init__(self, channel: socket.socket, writer: Writer, topics: list[str], patient: bool) -> None:
         self.channel = channel
         self.writer = writer
         self.topics = topics
-        self.queue: queue.Queue[tuple[int, float, bytes] | None] = queue.Queue()
+        self.patient = patient  # the sender waits for this thread, so this thread may for the other
+        self.queue: queue.Queue[tuple[int, float, bytes] | None] = queue.Queue(QUEUE_LENGTH)
         self.lost: dict[tuple[int, int], int] = {}  # (sink, topic) -> records it dropped
         self.overflowed = [0] * len(topics)
         self.refused = [0] * len(topics)
@@ -216,7 +177,11 @@ class _Drain:
         dropped = [a + b for a, b in zip(self.overflowed, self.refused, strict=True)]
         for (_, topic), lost in self.lost.items():
             dropped[topic] += lost
-        return _ending(self.topics, self.writer, dropped)
+        return {
+            "written": dict(zip(self.topics, self.writer.written, strict=True)),
+            "dropped": dict(zip(self.topics, dropped, strict=True)),
+            "stopped": self.writer.stopped,
+        }
 
     def _receive(self, wait: float) -> bool:
         """Take in what has arrived. False: there is nothing more to come."""
@@ -228,9 +193,9 @@ class _Drain:
         sink, topic, dropped, _, time = ENVELOPE.unpack_from(datagram)
         self.lost[sink, topic] = dropped
         if len(datagram) > ENVELOPE.size:
-            if self.queue.qsize() < QUEUE_LENGTH:
-                self.queue.put((topic, time, datagram[ENVELOPE.size :]))
-            else:
+            try:
+                self.queue.put((topic, time, datagram[ENVELOPE.size :]), block=self.patient)
+            except queue.Full:
                 self.overflowed[topic] += 1
         return True
 
@@ -275,7 +240,7 @@ def main(descriptor: int) -> int:
     except Sim2realError as error:
         _say(event="error", text=str(error))
         return 2
-    drain = _Drain(channel, writer, list(layouts))
+    drain = _Drain(channel, writer, list(layouts), job["patient"])
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: setattr(drain, "ending", True))
     _say(event="ready")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim2real.recorder.process import Direct
+from sim2real.recorder.mcap import Writer
 from sim2real.records import QUATERNION, Layout, pilot_layout, tick_layout
 
 JOINTS = ("left_hip_joint", "left_knee_joint", "Right Hip/Joint")
@@ -43,9 +43,8 @@ def write_record(
     attachments: dict[str, bytes] | None = None,
 ) -> Path:
     """A finished record of ``arrays``, all topics in the order of their times."""
-    direct = Direct(path, layouts, metadata, attachments)
+    writer = Writer(path, layouts, metadata, attachments)
     order = sorted((t, k, i) for k, topic in enumerate(layouts) for i, t in enumerate(arrays[topic]["time"].tolist()))
     for time, k, i in order:
-        assert direct.write(k, time, arrays[list(layouts)[k]][i : i + 1])
-    direct.close()
-    return path
+        assert writer.write(k, time, arrays[list(layouts)[k]][i : i + 1])
+    return writer.finish({"written": dict(zip(layouts, writer.written, strict=True))})

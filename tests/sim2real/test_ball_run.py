@@ -19,7 +19,7 @@ from sim2real.object.scene import AWAY, HANDING_OVER, Handover, prepare_for
 from sim2real.operators.script import ScriptOperator, Step
 from sim2real.policy import load_policy
 from sim2real.recorder.plot import page
-from sim2real.recorder.process import Direct
+from sim2real.recorder.process import Recorder
 from sim2real.recorder.run import Run
 from sim2real.recorder.summary import summarise
 from sim2real.simulation import Scene, Simulation
@@ -55,15 +55,15 @@ def test_a_placed_ball_lies_there_and_is_seen_recorded_and_drawn(g1, seeing, tmp
         if 0.1 < run.since < 0.5:  # later it is damped, and sinks
             fed.append((run.player.inputs["object_position_in_base"].copy(), run.world.truth()))
 
-    sinks = []
+    recorders = []
 
     def sink_for(layouts):
-        sinks.append(Direct(record, layouts, {"robot": "g1"}, {"robot.yaml": g1.path.read_bytes()}))
-        return sinks[0]
+        recorders.append(Recorder(record, layouts, {"robot": "g1"}, {"robot.yaml": g1.path.read_bytes()}, patient=True))
+        return recorders[0].sink
 
     run = perform(g1, seeing(**PLACED), sink_for=sink_for, each_tick=look)
     summary = run.run()
-    sinks[0].close()
+    recorders[0].close()
     assert not summary.faults and not any("S2R-028" in m for m in summary.messages)
     for seen, truth in fed:
         assert truth.position_object_in_world[2] == pytest.approx(RADIUS, abs=0.002)
@@ -183,7 +183,6 @@ def test_a_world_without_a_ball_says_so(g1):
 @pytest.mark.slow
 def test_in_real_time_the_camera_sends_datagrams(g1, seeing, tmp_path):
     from sim2real.pilot import topics
-    from sim2real.recorder.process import Recorder
 
     player = SkillPlayer(g1, [seeing(**PLACED)])
     recorder = Recorder(tmp_path / "run.mcap", topics(g1, [b.name for b in g1.wiring().buses], player))

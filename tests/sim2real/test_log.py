@@ -20,7 +20,7 @@ from sim2real.guardian import Guardian
 from sim2real.operators.script import ScriptOperator, Step
 from sim2real.policy import load_policy
 from sim2real.recorder.plot import page
-from sim2real.recorder.process import Direct
+from sim2real.recorder.process import Recorder, Sink
 from sim2real.recorder.reader import Reader
 from sim2real.recorder.replay import replay
 from sim2real.recorder.run import Run, spans
@@ -45,12 +45,12 @@ def tiny(tmp_path_factory) -> Path:
 def record(tiny, tmp_path_factory) -> Path:
     robot, policy = load_robot("g1"), load_policy(tiny)
     path = tmp_path_factory.mktemp("run") / "g1.mcap"
-    sinks = []
+    recorders = []
 
-    def sink_for(layouts) -> Direct:
+    def sink_for(layouts) -> Sink:
         attachments = {"robot.yaml": robot.path.read_bytes(), "tiny.onnx": tiny.read_bytes()}
-        sinks.append(Direct(path, layouts, {"robot": "g1", "clock": "lockstep"}, attachments))
-        return sinks[0]
+        recorders.append(Recorder(path, layouts, {"robot": "g1", "clock": "lockstep"}, attachments, patient=True))
+        return recorders[0].sink
 
     def cut_power(simulation: Simulation) -> None:
         if simulation.since >= SILENT_AFTER and not cut:
@@ -65,7 +65,7 @@ def record(tiny, tmp_path_factory) -> Path:
         patch.setattr(Guardian, "damp_time", 0.1)
         Simulation(robot, [policy], operator, Scene(seed=3), sink_for=sink_for, each_tick=cut_power).run()
     assert cut
-    sinks[0].close()
+    recorders[0].close()
     return path
 
 
@@ -402,12 +402,12 @@ def test_two_policies_replay_through_their_blends(tmp_path):
     files = [sealed(tmp_path / "a.onnx", "a", "stand", 0.0), sealed(tmp_path / "b.onnx", "b.c", "lean", 0.02)]
     policies = [load_policy(path) for path in files]
     path = tmp_path / "two.mcap"
-    sinks = []
+    recorders = []
 
-    def sink_for(layouts) -> Direct:
+    def sink_for(layouts) -> Sink:
         attachments = {"robot.yaml": robot.path.read_bytes(), **{f.name: f.read_bytes() for f in files}}
-        sinks.append(Direct(path, layouts, {}, attachments))
-        return sinks[0]
+        recorders.append(Recorder(path, layouts, {}, attachments, patient=True))
+        return recorders[0].sink
 
     steps = [Step("stand", 0.4), Step("lean", 0.4), Step("stand", 0.2)]
     with pytest.MonkeyPatch.context() as patch:
@@ -415,7 +415,7 @@ def test_two_policies_replay_through_their_blends(tmp_path):
         patch.setattr(SkillPlayer, "move_time", 0.3)
         patch.setattr(Guardian, "damp_time", 0.1)
         Simulation(robot, policies, ScriptOperator(steps), Scene(seed=3), sink_for=sink_for).run()
-    sinks[0].close()
+    recorders[0].close()
     run = Run(path)
     performed = [s.value[1] for s in run.skills() if s.value[0] == 2]
     assert performed == [0, 1, 0]

@@ -284,17 +284,17 @@ def test_a_chunk_that_claims_too_much_is_not_unpacked(record, tmp_path):
 FULL = """
 import resource, sys
 from recorded import LAYOUTS, random_walk
-from sim2real.recorder.process import Direct
+from sim2real.recorder.mcap import Writer
 from sim2real.types import Sim2realError
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
 try:
-    direct = Direct(sys.argv[1], LAYOUTS, {}, {"robot.yaml": b"x"})
+    writer = Writer(sys.argv[1], LAYOUTS, {}, {"robot.yaml": b"x"})
 except Sim2realError as error:
     sys.exit(str(error))
 rows = random_walk(LAYOUTS["/tick"], 8000)
-kept = [direct.write(0, t, rows[i : i + 1]) for i, t in enumerate(rows["time"].tolist())]
-ending = direct.close()
-print(sum(kept), kept == sorted(kept, reverse=True), direct.poll(), ending)
+kept = [writer.write(0, t, rows[i : i + 1]) for i, t in enumerate(rows["time"].tolist())]
+writer.finish({"dropped": {"/tick": kept.count(False)}})
+print(sum(kept), kept == sorted(kept, reverse=True), writer.stopped)
 """
 
 
@@ -314,7 +314,7 @@ def test_a_full_disk_ends_the_record_as_a_whole_file(tmp_path):
     reader = Reader(path)  # whole, index and all: nothing to repair
     n = len(reader["/tick"])
     assert 100 < n < 8000
-    assert done.stdout.startswith(f"{n} True ['{path}: recording stopped: File too large']")
+    assert done.stdout.strip() == f"{n} True {path}: recording stopped: File too large"
     assert json.loads(reader.ending["dropped"])["/tick"] == 8000 - n
     assert reader["/tick"].tobytes() == random_walk(LAYOUTS["/tick"], 8000)[:n].tobytes()
     assert path.stat().st_size <= 5_000_000

@@ -7,8 +7,10 @@ import multiprocessing
 import os
 import resource
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -16,6 +18,8 @@ import numpy as np
 import pytest
 from recorded import LAYOUTS, random_walk
 
+from sim2real.recorder import process
+from sim2real.recorder.mcap import Writer
 from sim2real.recorder.process import Recorder, Sink
 from sim2real.recorder.reader import Reader
 from sim2real.recorder.repair import repair
@@ -66,6 +70,37 @@ def test_a_stopped_recorder_blocks_nobody_and_is_told_of_every_loss(tmp_path):
     reader = Reader(tmp_path / "run.mcap")
     assert reader["/tick"].tobytes() == rows[np.array(sent)].tobytes()
     assert json.loads(reader.ending["dropped"]) == ending["dropped"]
+
+
+def test_a_patient_sink_waits_for_a_stopped_recorder_and_loses_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "CHANNEL_SIZE", 64 * 1024)
+    recorder = Recorder(tmp_path / "run.mcap", LAYOUTS, patient=True)
+    os.kill(recorder.pid, signal.SIGSTOP)
+    sent: list[bool] = []
+    sender = threading.Thread(target=lambda: sent.extend(send(recorder.sink, 0, TICKS)))
+    sender.start()
+    sender.join(0.2)
+    assert sender.is_alive() and not sent
+    os.kill(recorder.pid, signal.SIGCONT)
+    sender.join(60)
+    assert sent == [True] * len(TICKS)
+    assert recorder.close(60)["dropped"] == {"/tick": 0, "/pilot": 0}
+    assert Reader(tmp_path / "run.mcap")["/tick"].tobytes() == TICKS.tobytes()
+
+
+def test_a_patient_process_waits_for_its_disk(tmp_path, monkeypatch):
+    monkeypatch.setattr(process, "QUEUE_LENGTH", 3)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    writer = Writer(tmp_path / "run.mcap", LAYOUTS)
+    sink, drain = Sink(ours, len(LAYOUTS), patient=True), process._Drain(theirs, writer, list(LAYOUTS), patient=True)
+    receiver = threading.Thread(target=drain.run)
+    receiver.start()
+    assert send(sink, 0, TICKS) == [True] * len(TICKS)
+    sink.close()
+    receiver.join(60)
+    writer.finish()
+    assert drain.overflowed == [0, 0]
+    assert Reader(tmp_path / "run.mcap")["/tick"].tobytes() == TICKS.tobytes()
 
 
 def pilot(sink: Sink) -> None:
