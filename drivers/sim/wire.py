@@ -16,7 +16,6 @@ from bisect import insort
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import lru_cache
 from heapq import heapify, heappop, heappush
 from typing import Protocol
 
@@ -64,7 +63,6 @@ class Traffic:
     bus_off: int = 0  # how often the host's controller left the bus
 
 
-@lru_cache(4096)
 def priority(id: int) -> int:
     """Arbitration key of an identifier, the lowest wins: base identifier first, and a standard frame before an extended
     one with the same base (ISO 11898-1)."""
@@ -97,7 +95,7 @@ class SimCan:
         self._motors, self._latency, self._reply_delay, self._room = motors, latency, reply_delay, queue_length
         self._bit = 1.0 / spec.bitrate
         self._queue: deque[tuple] = deque()  # the host's: (ready, key, id, raw, bits, tries)
-        self._waiting: deque[tuple] = deque()  # answers to come, sorted: (ready, as in ``_contending``)
+        self._waiting: deque[tuple] = deque()  # answers to come, sorted: (ready, key, order, raw, bits, row, tries)
         self._contending: list[tuple] = []  # heap of answers that want the wire: (key, order, raw, bits, row, tries)
         self._free = 0.0  # when the wire is idle again
         self._order = 0
@@ -152,14 +150,14 @@ class SimCan:
     def take(self, ready: float, raw: bytes, ids: Iterable[int], bits: Iterable[int]) -> None:
         """Frames of the host, whose length on the wire is now known, enter its controller's queue."""
         size = self.frame.itemsize
-        raws = [raw[at : at + size] for at in range(0, len(raw), size)]
-        self._queue += [(ready, priority(id), id, r, n, 0) for id, r, n in zip(ids, raws, bits, strict=True)]
+        for i, (id, n) in enumerate(zip(ids, bits, strict=True)):
+            self._queue.append((ready, priority(id), id, raw[size * i : size * i + size], n, 0))
 
     def say(self, ready: float, answer: tuple[int, int, bytes, int]) -> None:
         """A motor wants to send a frame (row, key, raw frame, bits) from ``ready`` on, without having been asked."""
         row, key, raw, bits = answer
         self._order += 1
-        insort(self._waiting, (ready, (key, self._order, raw, bits, row, 0)))
+        insort(self._waiting, (ready, key, self._order, raw, bits, row, 0))
 
     @property
     def busy(self) -> bool:
@@ -179,9 +177,8 @@ class SimCan:
         if (self._host_faults or self._away_until > self._free or not all(powered)) and self._stalls(until):
             return
         traffic, carried, inbox, latency = self.traffic, self.carried, self.inbox, self._latency
-        free = self._free
         while True:
-            start = free
+            start = self._free
             if not contending:
                 first = queue[0][0] if queue else until
                 if waiting and waiting[0][0] < first:
@@ -189,56 +186,54 @@ class SimCan:
                 if first > start:
                     start = first
             if start >= until:
-                break
-            free = start
+                return
             while waiting and waiting[0][0] <= start:
-                heappush(contending, waiting.popleft()[1])
-            copies = 1
+                heappush(contending, waiting.popleft()[1:])
+            self._free = start
             if queue and queue[0][0] <= start and (not contending or queue[0][1] < contending[0][0]):
                 _, _, id, raw, bits, tries = queue[0]
                 end = start + bits * bit
                 if end > until:
-                    break
+                    return
                 queue.popleft()
-                if faults:
-                    copies = self._spoil_command(faults, start, id, raw, bits, tries)
-                    if copies is None:
-                        free = max(start, self._free)
-                        continue
+                copies = self._spoil_command(faults, start, id, raw, bits, tries) if faults else 1
+                if copies is None:
+                    continue
+                self._free = end
+                traffic.busy += end - start
+                traffic.frames += 1
+                carried.append(raw)
                 if self._errors:
                     self._errors -= 1
-                while copies:
-                    copies -= 1
+                for _ in range(copies):
                     answer = receive(bus, id, raw, end)
                     if answer is not None:
-                        row, key, reply, length = answer
+                        row, key, reply, bits = answer
                         self._order += 1
-                        item = (end + delay, (key, self._order, reply, length, row, 0))
+                        item = (end + delay, key, self._order, reply, bits, row, 0)
                         if waiting and waiting[-1] > item:  # behind one that a fault holds back
                             insort(waiting, item)
                         else:
                             waiting.append(item)
             else:
-                key, _, raw, bits, row, tries = contending[0]
+                _, _, raw, bits, row, tries = contending[0]
                 end = start + bits * bit
                 if end > until:
-                    break
-                heappop(contending)
+                    return
+                key, order, raw, bits, row, tries = heappop(contending)
                 if not powered[row]:
                     continue
+                copies = 1
                 if faults:
                     copies, raw = self._spoil_feedback(faults, start, key, raw, bits, row, tries)
                     if copies is None:
-                        free = max(start, self._free)
                         continue
-                while copies:
-                    copies -= 1
+                self._free = end
+                traffic.busy += end - start
+                traffic.frames += 1
+                carried.append(raw)
+                for _ in range(copies):
                     inbox.append((end + latency, raw))
-            free = end
-            carried.append(raw)
-            traffic.busy += end - start
-            traffic.frames += 1
-        self._free = free
 
     def away(self, now: float) -> bool:
         """Whether the host's controller is off the bus."""
@@ -315,12 +310,12 @@ class SimCan:
             elif fault.kind == "duplicate":
                 copies = 2
             elif fault.kind == "delay" and tries == 0:
-                insort(self._waiting, (start + fault.value, (key, self._order, raw, bits, row, 1)))
+                insort(self._waiting, (start + fault.value, key, self._order, raw, bits, row, 1))
                 return None, raw
             elif fault.kind == "corrupt":
                 self._break_off(start, bits)
                 if tries < BUS_OFF_TRIES:
-                    insort(self._waiting, (self._free, (key, self._order, raw, bits, row, tries + 1)))
+                    insort(self._waiting, (self._free, key, self._order, raw, bits, row, tries + 1))
                 return None, raw
             elif fault.kind in FEEDBACK:
                 raw = self._lie(fault, row, raw)
@@ -344,7 +339,7 @@ class SimCan:
 
     def forget(self, row: int) -> None:
         """A motor lost its power: what it wanted to say is gone."""
-        self._waiting = deque(w for w in self._waiting if w[1][4] != row)
+        self._waiting = deque(w for w in self._waiting if w[5] != row)
         self._contending = [c for c in self._contending if c[4] != row]
         heapify(self._contending)
 
