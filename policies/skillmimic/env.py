@@ -24,7 +24,7 @@ from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.observations import observe
 from policies.skillmimic.randomisation import LOSS_TICKS, Randomisation
 from policies.skillmimic.rewards import SENSITIVITIES, Motion, Step, reward
-from policies.skillmimic.stance import ARM_POINTS
+from policies.skillmimic.stance import arms, moved
 from policies.skillmimic.terminations import failed, up
 
 BASE, JOINTS, BALL = slice(0, 7), slice(7, -7), slice(-7, -4)  # of qpos
@@ -177,7 +177,10 @@ class Env(VecEnv):
         self.apart = np.linalg.norm(qpos[:, BALL] - qpos[:, :3], axis=1)
         upright = up(qpos[:, 3:7]), up(reference.orientation_base_in_world)
         if self.graph.base is not None:
-            state, acceleration = self._arms(self._standing(state, qvel)), acceleration[:, self.graph.acting]
+            trunk, stance = (self._bodies[:, self._trunk], self._turns[:, self._trunk]), self.clips.skill[self.clip]
+            there = self.clips.trunk_position[stance], self.clips.trunk_orientation[stance]
+            state = arms(moved(state, qvel, trunk, there), self.graph.acting)
+            acceleration = acceleration[:, self.graph.acting]
         away = lambda there, here: np.where(gone[:, None], here, there)  # noqa: E731
         reference = reference._replace(
             object_position=away(reference.object_position, state.object_position),
@@ -188,28 +191,7 @@ class Env(VecEnv):
     def reference(self, rows: np.ndarray, way: np.ndarray) -> Motion:
         """What is imitated at table ``rows`` (N,), as ``_judge`` sees states."""
         motion = self.clips.motion(rows, way)
-        return motion if self.graph.base is None else self._arms(motion)
-
-    def _arms(self, m: Motion) -> Motion:
-        """All that an actor can help who moves nothing but the arms."""
-        points, level = m.points[:, 1 + ARM_POINTS], np.tile([1.0, 0, 0, 0], (len(m.points), 1))
-        acting = self.graph.acting
-        return Motion(points, np.zeros_like(points), level, m.joint_pos[:, acting], m.joint_vel[:, acting],
-                      m.object_position, m.object_velocity, m.contact)  # fmt: skip
-
-    def _standing(self, m: Motion, qvel: np.ndarray) -> Motion:
-        """``m`` moved to where its trunk is that of the skill's stance, in which its clips are."""
-        stance = self.clips.skill[self.clip]
-        here, facing = self.clips.trunk_position[stance], self.clips.trunk_orientation[stance]
-        there = self._bodies[:, self._trunk]
-        turn = multiply(facing, conjugate(self._turns[:, self._trunk]))
-        base, spin = m.points[:, 0], rotate(m.orientation_base_in_world, qvel[:, SPIN])
-        drift = qvel[:, :3] + np.cross(spin, there - base)
-        return m._replace(
-            points=here[:, None] + rotate(turn[:, None], m.points - there[:, None]),
-            object_position=here + rotate(turn, m.object_position - there),
-            object_velocity=rotate(turn, m.object_velocity - drift),
-        )
+        return motion if self.graph.base is None else arms(motion, self.graph.acting)
 
     def _observe(self) -> None:
         """Measure every robot; what its actor sees this tick, and what only the critic sees."""
