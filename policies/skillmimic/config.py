@@ -25,6 +25,8 @@ class SkillMimic:
     # Who moves the legs: a checkpoint of the basics, which goes into the policy as it is, and the actor moves the arms. None:
     # the actor moves every joint, as in the paper.
     base: str | None = None
+    corrections: str | None = None  # of the plan of the arms (plan.py), a file; only with a base
+    timed: tuple[str, ...] = ("catch", "dribble_in_place")  # skills in which the ball, and not the clock, says how far on
     walks: tuple[str, ...] = ()  # skills during which the base obeys velocity commands
     still: float = 0.3  # share of their episodes without any
     # the policy
@@ -75,15 +77,15 @@ class SkillMimic:
 
 
 BASE = "policies/g1/basics.pt"
-BALL = {
-    **{
-        skill: [f"{skill}_{k:02d}" for k in range(1, 1 + n)]
-        for skill, n in (("hold", 7), ("carry", 4), ("pass", 3), ("catch", 7))
-    },
-    "dribble_in_place": ["dribble_in_place_01"],
+BALL = {  # a clip each: the calmest, and those that come from and go to the front
+    "hold": "hold_01",
+    "carry": "carry_01",
+    "pass": "pass_02",
+    "catch": "catch_03",
+    "dribble_in_place": "dribble_in_place_01",
 }
 TASKS: dict[str, SkillMimic] = {
-    "g1-ball": SkillMimic(base=BASE, skills=tuple(BALL), clips=tuple(clip for clips in BALL.values() for clip in clips),
+    "g1-ball": SkillMimic(base=BASE, corrections="policies/g1/plan.yaml", skills=tuple(BALL), clips=tuple(BALL.values()),
                           walks=("carry",), frames=150),
     "g1-pickup": SkillMimic(clips=(), skills=("pickup",), balance_gain=0.0, balance_damping=0.0, samples=100e6),
 }  # fmt: skip

@@ -56,6 +56,8 @@ class Env(VecEnv):
         self.substeps = round(config.period / config.timestep)
         self.batch = Batch(self.model, n, config.threads)
         self.random = Randomisation(self.batch, self.model)
+        timed = np.array([name in config.timed for name in config.skills])
+        self._timed = timed[self.clips.skill]  # whose clock is the plan's
         self._ends = ~(self.clips.swing | self.clips.loop)
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._anchors, self._sites = self.batch.bind("xanchor"), self.batch.bind("site_xpos")
@@ -68,6 +70,7 @@ class Env(VecEnv):
             "sensordata": np.zeros((n, self.substeps, self.model.nsensordata)),
         }
         self.clip, self.row = np.zeros(n, np.intp), np.zeros(n, np.intp)  # what is imitated, and how far it is
+        self._begun = np.zeros(n, np.intp)  # where in the clip an episode started
         self.skill, self.command = torch.zeros(n, len(self.graph.labels)), torch.zeros(n, 3)
         self.carries = {k: torch.zeros(n, *v) for k, v in self.graph.inputs().items() if k.startswith("carry_")}
         self.action, self.target = torch.zeros(n, self.num_actions), torch.zeros(n, joints)
@@ -105,7 +108,8 @@ class Env(VecEnv):
         rewards[~np.isfinite(rewards)] = 0.0
         self.episode_length_buf += 1
         over = self.episode_length_buf.numpy() >= self.max_episode_length
-        beyond = self.row - self.clips.length[self.clip] + 1  # physics steps past the end of a clip that has one
+        since = self._begun + self.episode_length_buf.numpy() * self.substeps
+        beyond = since - self.clips.length[self.clip] + 1  # physics steps past the end of a clip that has one
         over |= self._ends[self.clip] & (beyond * self.config.timestep >= self.config.after)
         timeouts = over & ~self.failures
         self._push()
@@ -153,6 +157,9 @@ class Env(VecEnv):
             out=self._recorded,
         )
         self.row += self.substeps
+        if self.graph.plan is not None:
+            clock = self.carries["carry_clock"][:, 0].numpy()
+            self.row = np.where(self._timed[self.clip], np.round(clock * self.substeps).astype(int), self.row)
 
     def _judge(self, action_change: np.ndarray) -> Step:
         """The state and its reference, one physics step before now."""
@@ -186,7 +193,8 @@ class Env(VecEnv):
             object_position=away(reference.object_position, state.object_position),
             object_velocity=away(reference.object_velocity, state.object_velocity),
         )
-        return Step(state, reference, acceleration, action_change, qpos[:, 2], *upright)
+        bounces = self.clips.loop[self.clip]
+        return Step(state, reference, acceleration, action_change, qpos[:, 2], *upright, bounces)
 
     def reference(self, rows: np.ndarray, way: np.ndarray) -> Motion:
         """What is imitated at table ``rows`` (N,), as ``_judge`` sees states."""
@@ -293,6 +301,7 @@ class Env(VecEnv):
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         clip, row = self.clips.sample(rng, k, self.skills)
         self.clip[ids], self.row[ids] = clip, row if self.config.anywhere else 0
+        self._begun[ids] = self.row[ids]
         rows, _ = self.clips.rows(self.clip[ids], self.row[ids])
         qpos, qvel = self.clips.qpos[rows].copy(), self.clips.qvel[rows].copy()
         self._disturb(qpos, qvel, rng.random(k) < self.config.disturbed)
@@ -304,7 +313,12 @@ class Env(VecEnv):
         self.action[ids] = 0.0
         for carry in self.carries.values():
             carry[ids] = 0.0
-        if self.graph.base is not None:  # whose arms are where they are sent
+        if self.graph.base is not None:
+            self.carries["carry_skill"][ids] = self.skill[ids]
+            self.carries["carry_clock"][ids] = _tensor(
+                np.where(self.clips.swing[clip], 0.0, self.row[ids] / self.substeps)[:, None]
+            )
+            # whose arms are where they are sent
             self.carries["carry_base_posture"][ids] = torch.where(
                 self.graph.acts > 0, self.target[ids], _tensor(self.clips.stances[self.clips.skill[self.clip[ids]]])
             )

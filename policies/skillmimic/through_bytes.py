@@ -83,7 +83,7 @@ class Judge:
         ends = not (clips.swing[self.clip] or clips.loop[self.clip])
         if ends and row[0] >= clips.length[self.clip] and not reference.contact[0, 0]:  # it flies where it may
             reference = reference._replace(object_position=state.object_position, object_velocity=state.object_velocity)
-        step = Step(state, reference, np.zeros((1, 1)), np.zeros((1, 1)), height, tilt, there)
+        step = Step(state, reference, np.zeros((1, 1)), np.zeros((1, 1)), height, tilt, there, clips.loop[[self.clip]])
         self.failed = bool(failed(step, config.terminations)[0])
         self.sums += np.array(measure(step))[:, 0]
         self._rows.append((touched[0], state.object_velocity[0], apart[0], height[0], not self.failed))
