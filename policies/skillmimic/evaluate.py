@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 from policies.evaluate import UNSEEN, Rate
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.randomisation import TABLE
 from policies.skillmimic.rewards import Step
 
 # The paper's thresholds of a right frame, times the robot's length scale of 0.744: ball within 0.2 m, body within 0.1 m.
@@ -93,9 +94,14 @@ RULES: dict[str, Callable[[Trace, float, int], float]] = {
 """Success in [0, 1] of an episode of ``ticks``, had nothing failed, by skill; of every other skill: ``_kept``."""
 
 
+def rule_of(skill: str) -> Callable[[Trace, float, int], float]:
+    """What counts as a success of ``skill``."""
+    return RULES.get(skill, _kept)
+
+
 def succeeded(skill: str, trace: Trace, period: float, ticks: int) -> float:
     """By the skill's rule."""
-    return RULES.get(skill, _kept)(trace, period, ticks)
+    return rule_of(skill)(trace, period, ticks)
 
 
 def ticks_of(graph: PolicyGraph, clip: int, seconds: float) -> int:
@@ -149,19 +155,15 @@ def evaluate_skill(
     push: float = 0.0,
     seed: int = 0,
     act: Callable[[Env], Tensor] | None = None,
+    fixed: Mapping[str, float] | None = None,
 ) -> Result:
-    """As ``evaluate``, of one skill."""
-    config = dataclasses.replace(
-        graph.config,
-        envs=episodes,
-        frames=round(seconds / graph.config.period),
-        push_speed=push,
-        push_chance=graph.config.push_chance if push else 0.0,
-        anywhere=skill not in RULES,
-        disturbed=0.0,
-    )
-    env = Env(config, UNSEEN + seed, graph, skill)
-    env.episode_length_buf[:] = 0
+    """As ``evaluate``, of one skill. ``fixed``: terms of the randomisation that have one value instead."""
+    env = episodes_of(graph, skill, episodes, seconds, push, seed)
+    config = env.config
+    if fixed:
+        env.random.table = TABLE | {name: TABLE[name]._replace(low=x, high=x) for name, x in fixed.items()}
+        env.reset()
+        env.episode_length_buf[:] = 0
     act = act or (lambda e: graph.actor(e.observation))
     running, up = np.full(episodes, True), np.full(episodes, True)
     sums, frames, clips = np.zeros((episodes, len(Measures._fields))), np.zeros(episodes, int), env.clip.copy()
@@ -180,6 +182,23 @@ def evaluate_skill(
         for n, end in enumerate(frames)
     ]
     return result(np.array(shares), sums, frames)
+
+
+def episodes_of(graph: PolicyGraph, skill: str, episodes: int, seconds: float, push: float = 0.0, seed: int = 0) -> Env:
+    """An environment in which every robot begins an episode of ``skill``: at the beginning of a clip, where its rule needs
+    that."""
+    config = dataclasses.replace(
+        graph.config,
+        envs=episodes,
+        frames=round(seconds / graph.config.period),
+        push_speed=push,
+        push_chance=graph.config.push_chance if push else 0.0,
+        anywhere=skill not in RULES,
+        disturbed=0.0,
+    )
+    env = Env(config, UNSEEN + seed, graph, skill)
+    env.episode_length_buf[:] = 0
+    return env
 
 
 def traced(env: Env, up: np.ndarray) -> Trace:

@@ -7,7 +7,7 @@ from its soft start, or from the skill before, and not from the clip's first fra
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -179,12 +179,19 @@ class _Body:
 
 
 def deploy_episode(
-    path: Path, graph: PolicyGraph, clip: int, seconds: float, camera: CameraModel | None, seed: int
+    path: Path,
+    graph: PolicyGraph,
+    clip: int,
+    seconds: float,
+    camera: CameraModel | None,
+    seed: int,
+    watch: Callable[[Simulation], None] = lambda simulation: None,
 ) -> Judge:
     """One lockstep run of the skill of clip number ``clip``, on a randomised body with a randomised ball.
 
     ``seconds``: its length, as in ``ticks_of``. A skill that walks is told a velocity as in training. ``camera`` None: the
-    policy is fed the truth about its ball. A fault of the safety gate, and a run that ends before its time, fail.
+    policy is fed the truth about its ball. A fault of the safety gate, and a run that ends before its time, fail. ``watch`` is
+    called after every tick of the guardian.
     """
     rng = np.random.default_rng([seed, clip])
     config, ticks = graph.config, ticks_of(graph, clip, seconds)
@@ -192,8 +199,13 @@ def deploy_episode(
     steps = [] if label == first else [(first, BEFORE)]
     steps.append((label, ticks * config.period + AFTER))
     judge = Judge(graph, clip, ticks)
+
+    def each_tick(simulation: Simulation) -> None:
+        judge(simulation)
+        watch(simulation)
+
     scene = Scene(seed=seed, prepare=random_body(rng), camera=camera, ball=random_ball(rng))
-    simulation = deployed(path, steps, scene, [NONE] * (len(steps) - 1) + [command(graph, label, rng)], judge)
+    simulation = deployed(path, steps, scene, [NONE] * (len(steps) - 1) + [command(graph, label, rng)], each_tick)
     starts = {n: ObjectStart.model_validate(object_start(graph, clip if n == label else 0)) for n in {first, label}}
     simulation.handover = Handover(simulation.world, starts)
     summary = simulation.run()

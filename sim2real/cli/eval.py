@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import tyro
@@ -27,9 +28,18 @@ class Args:
     """write every number to this JSON file"""
     card: Path | None = None
     """write the policy's card to this Markdown file"""
+    tables: bool = False
+    """of ball skills: other balls and every switch too (the paper's Tables 2 and 3), a fifth of the episodes a cell"""
+    runs: tyro.conf.UseAppendAction[list[Path]] = field(default_factory=list)
+    """of ball skills: the training runs that led to the file, in their order; what they learned when is in the card"""
+    videos: Path | None = None
+    """of ball skills: film each into this folder, as the deployed loop performs it"""
 
 
 def main(argv: list[str]) -> int:
     args = tyro.cli(Args, args=argv, prog="sim2real eval")
-    good = training_side("policies.card").eval_command(args.file, args.episodes, args.deployed, args.report, args.card)
+    if args.videos and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo looks at this once, when it is first imported
+    given = asdict(args)
+    good = training_side("policies.card").eval_command(card_file=given.pop("card"), **given)
     return 0 if good else 1
