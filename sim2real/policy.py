@@ -78,6 +78,11 @@ class Policy:
         for name, (carry, start) in self._starts.items():
             carry[...] = start if carries is None or name not in carries else carries[name]
 
+    @property
+    def carries(self) -> Mapping[str, np.ndarray]:
+        """What the next step will be told of this one, by name, without the batch axis."""
+        return {name: carry[0] for name, (carry, _) in self._starts.items()}
+
     def step(self, inputs: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         """One policy period.
 

@@ -141,9 +141,10 @@ class ReferenceClips:
         ball_in_base = rotate(turn, m.object_position[at] - m.points[at, 0])
         velocity = rotate(turn, m.object_velocity[at] - m.points_velocity[at, 0])
         target = (self.target[at] + self._lag * m.joint_vel[at])[:, acting]
+        pulls = pull * (m.contact[at, 0] == 0)
         if self.swing[clip]:
             target, ball_in_base = self.mean(skill)[0][None, acting], ball_in_base.mean(axis=0, keepdims=True)
-            velocity = np.zeros((1, 3))
+            velocity, pulls = np.zeros((1, 3)), np.zeros(1)
         data, back = mujoco.MjData(self._model), np.zeros((len(target), len(acting), 3))
         for t in range(len(target)):
             if gone[t]:
@@ -155,7 +156,7 @@ class ReferenceClips:
                 link = self._model.site_bodyid[site]
                 jacobian = _jacobian(self._model, data, data.site_xpos[site], link)[:, acting]
                 back[t] += jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + SINGULAR**2 * np.eye(3))
-        return Rows(target, ball_in_base, velocity, back, bool(self.loop[clip]), pull * (m.contact[at, 0] == 0))
+        return Rows(target, ball_in_base, velocity, back, bool(self.loop[clip]), pulls)
 
     def _gone(self, clip: int, at: np.ndarray) -> np.ndarray:
         """(rows,) bool: whether the ball has left the hands for good."""

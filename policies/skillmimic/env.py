@@ -304,6 +304,8 @@ class Env(VecEnv):
         self._begun[ids] = self.row[ids]
         rows, _ = self.clips.rows(self.clip[ids], self.row[ids])
         qpos, qvel = self.clips.qpos[rows].copy(), self.clips.qvel[rows].copy()
+        flies = self.clips.motion(rows, np.ones(k)).contact[:, :1] == 0
+        qvel[:, FLIGHT] += flies * rng.uniform(-self.config.throw, self.config.throw, (k, 3))
         self._disturb(qpos, qvel, rng.random(k) < self.config.disturbed)
         self._qpos[ids], self._qvel[ids] = qpos, qvel
         self._recorded["qpos"][ids], self._recorded["qvel"][ids] = qpos[:, None], qvel[:, None]

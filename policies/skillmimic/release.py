@@ -27,8 +27,8 @@ from sim2real.contract import Contract
 from sim2real.policy import Policy
 from sim2real.types import Sim2realError
 
-SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "walks", "period", "timestep", "action_ratio", "action_max", "grip", "balance_gain",
-            "balance_damping", "position_margin", "history", "frames", "terminations")  # fmt: skip
+SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "walks", "corrections", "timed", "period", "timestep", "action_ratio", "action_max", "grip", "balance_gain",
+            "balance_damping", "position_margin", "history", "frames", "throw", "terminations")  # fmt: skip
 OPEN = 0.05  # m
 SHOWN, NONE = (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)  # m/s, m/s, rad/s: commands of a timeline that names none
 GOLDEN_STEPS, GOLDEN = 40, 4  # ticks of each golden sequence, and how many

@@ -45,6 +45,7 @@ class Judge:
         self._rows: list[tuple] = []  # of the Trace
         self._touched = np.zeros(0, bool)
         self._began: float | None = None
+        self._clock: float | None = None
         self._laid: _Laid | None = None
         self._read: _Body | None = None
 
@@ -70,12 +71,14 @@ class Judge:
         if self.failed or self.frames == self.ticks or simulation.guardian.record["tick"][0] % simulation.every:
             return
         touched, self._touched = self._touched, np.zeros(0, bool)
+        before, self._clock = self._clock, self._now(player.policies[player.policy_index])
         if self._began is None:
             if simulation.since >= 0 and player.labels[player.skill] == self.label:
                 self._began = simulation.since
             return  # whoever throws the ball does so now, and training too looks a tick later first
         state, qvel = body.motion(touched), body.velocity()
-        row = np.array([round((simulation.since - self._began) / config.timestep)])
+        since = simulation.since - self._began if before is None else before * config.period
+        row = np.array([round(since / config.timestep)])
         reference = clips.motion(*clips.rows(np.array([self.clip]), row))
         height, tilt, there = state.points[:, 0, 2], *(up(m.orientation_base_in_world) for m in (state, reference))
         apart = np.linalg.norm(state.object_position - state.points[:, 0], axis=1)
@@ -87,6 +90,10 @@ class Judge:
         self.failed = bool(failed(step, config.terminations)[0])
         self.sums += np.array(measure(step))[:, 0]
         self._rows.append((touched[0], state.object_velocity[0], apart[0], height[0], not self.failed))
+
+    def _now(self, policy: Any) -> float | None:
+        """How far the plan is, in ticks, of a skill whose plan waits for its ball."""
+        return float(policy.carries["carry_clock"][0]) if self.graph.plan is not None and self.label in self.graph.config.timed else None
 
     def _comparable(self, state: Motion, reference: Motion, qvel: np.ndarray, body: _Body) -> tuple[Motion, Motion]:
         """Both where training compares them: seen from the trunk if the legs are a base policy's, else laid on the clip."""
