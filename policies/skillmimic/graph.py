@@ -74,7 +74,9 @@ class PolicyGraph(nn.Module):
         self.register_buffer("acts", _buffer(acts))
         self.plan: Plan | None = None
         if self.base is not None:
-            rows = [self.clips.plan(k, self.acting, PULL * (name in config.timed)) for k, name in enumerate(self.labels)]
+            rows = [
+                self.clips.plan(k, self.acting, PULL * (name in config.timed)) for k, name in enumerate(self.labels)
+            ]
             file = ROOT / (config.corrections or "none")
             self.plan = Plan(rows, corrections(file, self.labels, len(self.acting)))
             self.register_buffer("spread", _buffer(np.eye(len(acts))[self.acting]))  # arms to joints

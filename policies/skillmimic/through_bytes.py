@@ -93,7 +93,11 @@ class Judge:
 
     def _now(self, policy: Any) -> float | None:
         """How far the plan is, in ticks, of a skill whose plan waits for its ball."""
-        return float(policy.carries["carry_clock"][0]) if self.graph.plan is not None and self.label in self.graph.config.timed else None
+        return (
+            float(policy.carries["carry_clock"][0])
+            if self.graph.plan is not None and self.label in self.graph.config.timed
+            else None
+        )
 
     def _comparable(self, state: Motion, reference: Motion, qvel: np.ndarray, body: _Body) -> tuple[Motion, Motion]:
         """Both where training compares them: seen from the trunk if the legs are a base policy's, else laid on the clip."""
