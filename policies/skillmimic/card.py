@@ -277,7 +277,7 @@ def show(console: Any, contract: Contract, e: Evaluation) -> None:
             table.add_row(label, WAY_NAMES[way], str(r.success), *numbers)
     console.print(table)
     for text in (table_2(e), table_3(e)):
-        console.print(text, markup=False, highlight=False)
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _link(file: Path, card_file: Path | None) -> str:
