@@ -240,11 +240,9 @@ def eval_command(
     tell = lambda text: console.print(f"[dim]{text} ...[/]")  # noqa: E731
     contract = load_policy(file).contract
     curve = read(runs) if runs else None
-    e = evaluate(file, episodes, deployed, tell, tables)
-    show(console, contract, e)
     pictures: dict[str, str] = {}
-    if videos:
-        from policies.skillmimic.film import film  # needs an OpenGL
+    if videos:  # first, so that a machine without OpenGL says so at once
+        from policies.skillmimic.film import film
 
         graph = graph_of(contract)
         for label in contract.skill_labels:
@@ -253,6 +251,8 @@ def eval_command(
             shown = film(file, graph, label, gif)
             console.print(f"{gif}: {f'run {shown}, the first good one' if shown else 'no good run among those tried'}")
             pictures[label] = _link(gif, card_file)
+    e = evaluate(file, episodes, deployed, tell, tables)
+    show(console, contract, e)
     if report:
         report.write_text(json.dumps(e.as_dict(), indent=1) + "\n")
     if card_file:
@@ -277,7 +277,7 @@ def show(console: Any, contract: Contract, e: Evaluation) -> None:
             table.add_row(label, WAY_NAMES[way], str(r.success), *numbers)
     console.print(table)
     for text in (table_2(e), table_3(e)):
-        console.print(text, markup=False, highlight=False)
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _link(file: Path, card_file: Path | None) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.sim.camera import Camera
+from policies.skillmimic.evaluate import ticks_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.through_bytes import BEFORE, deploy_episode
 from sim2real.object.camera import CameraModel
@@ -24,7 +25,7 @@ def film(path: Path, graph: PolicyGraph, label: str, gif: Path) -> int:
     """Write ``gif`` of a skill of a policy file, robot and ball drawn at random and the ball seen by a camera. Returns which
     run it shows, from 1; 0: none was good, it shows the last."""
     clips = np.flatnonzero(graph.clips.skill == graph.labels.index(label))
-    begin = 0.0 if label == graph.labels[0] else BEFORE - LEAD
+    skill = 0.0 if label == graph.labels[0] else BEFORE  # s: when it begins
 
     def run(seed: int, watch: Callable[[Simulation], None] = lambda simulation: None) -> bool:
         clip = int(clips[seed % len(clips)])
@@ -33,6 +34,12 @@ def film(path: Path, graph: PolicyGraph, label: str, gif: Path) -> int:
     good = next((seed for seed in range(TRIES) if run(seed)), -1)
     gif.parent.mkdir(parents=True, exist_ok=True)
     camera = Camera(gif, rate=RATE, width=SIZE[0], height=SIZE[1], distance=3.0)
-    run(good % TRIES, lambda simulation: camera.see(simulation.world.plant) if simulation.since >= begin else None)
+    end = skill + ticks_of(graph, int(clips[good % TRIES % len(clips)]), SECONDS) * graph.config.period
+
+    def watch(simulation: Simulation) -> None:
+        if max(0.0, skill - LEAD) <= simulation.since <= end:
+            camera.see(simulation.world.plant)
+
+    run(good % TRIES, watch)
     camera.save()
     return good + 1

@@ -7,7 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from drivers.bus import BusError
 from policies.clips.kinematics import multiply, rotate
 from policies.skillmimic.card import BallActor
 from policies.skillmimic.config import TASKS
@@ -91,6 +93,23 @@ def test_a_catch_begins_with_the_ball_thrown_as_in_its_clip(graph, file):
     start = object_start(graph, CATCH)
     velocity = judged._rows[0][1]  # a tick later, seen from the trunk
     np.testing.assert_allclose(velocity, np.add(start["velocity"], [0, 0, -9.81 * 0.02]), atol=0.5)
+
+
+@pytest.mark.slow
+def test_a_film_shows_the_first_good_run(graph, file, tmp_path, monkeypatch):
+    from policies.skillmimic import film
+
+    monkeypatch.setattr(film, "SECONDS", 0.3)
+    monkeypatch.setattr(film, "SIZE", (64, 64))
+    gif = tmp_path / "films" / "hold.gif"
+    try:
+        assert film.film(file, graph, "hold", gif) == 1
+    except BusError as error:
+        if "MUJOCO_GL" in str(error):
+            pytest.skip(str(error))
+        raise
+    with Image.open(gif) as shown:
+        assert shown.n_frames == pytest.approx(4, abs=1)  # at 12.5 Hz
 
 
 def test_an_episode_is_as_long_as_in_training(graph):
