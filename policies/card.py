@@ -26,6 +26,7 @@ from policies.randomisation import TABLE
 from policies.through_bytes import deploy_episode, stayed_up
 from sim2real.contract import Contract
 from sim2real.policy import load_policy
+from sim2real.types import Sim2realError
 
 SECONDS = 10.0  # of an episode
 PUSH = 0.5  # m/s
@@ -193,9 +194,12 @@ Share of {SECONDS:g} s episodes without a fall, with 95 % confidence, on robots 
 """
 
 
-def eval_command(file: Path, episodes: int, deployed: int, report: Path | None, card_file: Path | None) -> bool:
+def eval_command(
+    file: Path, episodes: int, deployed: int, report: Path | None, card_file: Path | None, **of_ball_skills: Any
+) -> bool:
     """``sim2real eval``: measure, print, write. Returns whether undisturbed survival is at least 95 % everywhere; of skills
-    with an object, see policies/skillmimic/card.py."""
+    with an object, see policies/skillmimic/card.py, which alone knows ``of_ball_skills``. Raises Sim2realError where such
+    are given for another policy."""
     from rich.console import Console
     from rich.table import Table
 
@@ -204,7 +208,9 @@ def eval_command(file: Path, episodes: int, deployed: int, report: Path | None, 
     if contract.object is not None:
         from policies.skillmimic.card import eval_command as eval_ball_skills
 
-        return eval_ball_skills(file, episodes, deployed, report, card_file)
+        return eval_ball_skills(file, episodes, deployed, report, card_file, **of_ball_skills)
+    if given := [f"--{name}" for name, value in of_ball_skills.items() if value]:
+        raise Sim2realError(f"{', '.join(given)}: belongs to ball skills, and {file} handles no ball; drop it")
     e = evaluate(file, Basics(), episodes, deployed, tell=lambda text: console.print(f"[dim]{text} ...[/]"))
     table = Table(title=f"{contract.name}: survival of {SECONDS:g} s (95 % confidence)", box=None)
     for column in ("skill", "undisturbed", f"pushed to {PUSH:g} m/s", "joint error"):

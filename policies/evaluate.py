@@ -78,6 +78,10 @@ class FileActor:
         """What every robot measures: (envs, size) by name."""
         return env.signals
 
+    def begin(self, env: Any, k: int) -> None:
+        """An episode of robot number ``k`` begins."""
+        self.policies[k].reset()
+
     def __call__(self, env: Any) -> Tensor:
         signals = {name: signal.numpy() for name, signal in self.signals(env).items()}
         born = env.episode_length_buf.numpy() == 0
@@ -85,7 +89,7 @@ class FileActor:
         targets = np.zeros((env.num_envs, env.model.nu), np.float32)
         for k, policy in enumerate(self.policies[: env.num_envs]):
             if born[k]:
-                policy.reset()
+                self.begin(env, k)
             outputs = policy.step({name: rows[k] for name, rows in signals.items()})
             actions[k], targets[k] = outputs["action"], outputs["joint_pos_target"]
         result = torch.from_numpy(actions)

@@ -44,7 +44,7 @@ REWARDS: dict[str, Reward] = {
     "legs": Reward(0.15, lambda t: _near((t.joint_pos - t.reference)[:, LEGS], 0.6)),
     "upright": Reward(0.2, lambda t: _near(t.gravity_in_base[:, :2], 0.2)),
     "height": Reward(0.1, lambda t: _near((t.height - t.height_reference)[:, None], 0.08)),
-    "velocity": Reward(0.3, lambda t: _near(t.velocity - t.command[:, :2], 0.3)),
+    "velocity": Reward(0.3, lambda t: _near(t.velocity - t.command[:, :2], 0.2)),
     "turn": Reward(0.05, lambda t: _near((t.angular_velocity_base_in_base - t.command)[:, 2:], 0.4)),
     "steady": Reward(0.05, lambda t: _near(t.angular_velocity_base_in_base[:, :2], 1.0)),
     "action_rate": Reward(-0.006, lambda t: np.sum(np.square(t.action - t.last_action), axis=-1)),

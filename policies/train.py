@@ -78,7 +78,8 @@ def graph_of(checkpoint: Path) -> PolicyGraph:
 
 def basics(document: dict[str, Any]) -> Basics:
     """Settings as ``dataclasses.asdict`` gave them."""
-    return Basics(**{**document, "stride": Stride(**document["stride"])})
+    stride = {k: tuple(v) if isinstance(v, list) else v for k, v in document["stride"].items()}
+    return Basics(**{**document, "stride": Stride(**stride)})
 
 
 def load_config(folder: Path) -> Basics:

@@ -8,6 +8,7 @@ import io
 import json
 import os
 import subprocess
+import time
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
@@ -62,6 +63,7 @@ class Training:
             self.folder.mkdir(parents=True, exist_ok=True)
             (self.folder / "config.json").write_text(json.dumps(self._provenance(), indent=1))
         while self.samples < config.samples:
+            began = time.process_time()
             row = self.step()
             if first and self.iteration % config.evaluate_every == 0:
                 row |= self.evaluate()
@@ -69,6 +71,7 @@ class Training:
                     self.best = row["score"]
                     self._save("best.pt")
             if first:
+                row["cpu"] = self.world * (time.process_time() - began)  # s, of all threads of all processes
                 with (self.folder / "curve.jsonl").open("a") as file:
                     file.write(json.dumps(row) + "\n")
                 report(row)

@@ -63,20 +63,25 @@ class Policy:
             self._binding.bind_ortvalue_output(name, onnxruntime.OrtValue.ortvalue_from_numpy(array))
         self._signals = {n: a[0] for n, a in inputs.items() if not n.startswith(CARRY)}
         self._carries = [(inputs[n], outputs[f"{n}_next"]) for n in contract.carry]
-        self._starts = [
-            (inputs[n], np.reshape(np.asarray(c.start, np.float32), inputs[n].shape) if c.start else 0.0)
+        self._starts = {
+            n: (inputs[n], np.reshape(np.asarray(c.start, np.float32), inputs[n].shape) if c.start else 0.0)
             for n, c in contract.carry.items()
-        ]
+        }
         self._outputs = {n: a[0] for n, a in outputs.items()}
         self.joint_pos_target = self._outputs["joint_pos_target"]  # (targets,) rad, of the latest step
         self.skill_value = self._outputs.get("skill_value")  # (skills,) of the latest step, or None
         self.golden_error = float("nan")  # largest error of the golden replay, once ``prove`` ran
         self.reset()
 
-    def reset(self) -> None:
-        """Start over: every carry at its stated start."""
-        for carry, start in self._starts:
-            carry[...] = start
+    def reset(self, carries: Mapping[str, np.ndarray] | None = None) -> None:
+        """Start over: every carry at its stated start, or as ``carries`` has it (by name, without the batch axis)."""
+        for name, (carry, start) in self._starts.items():
+            carry[...] = start if carries is None or name not in carries else carries[name]
+
+    @property
+    def carries(self) -> Mapping[str, np.ndarray]:
+        """What the next step will be told of this one, by name, without the batch axis."""
+        return {name: carry[0] for name, (carry, _) in self._starts.items()}
 
     def step(self, inputs: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         """One policy period.

@@ -32,10 +32,10 @@ SETTLING = 3  # strokes before the one that is kept: then inverse kinematics has
 class Stroke:
     """One bounce, at the size of the robot."""
 
-    peak: float = 0.77  # m, the ball's centre where the palm finds it
-    push: float = 0.18  # m that the palm stays on it
-    follow: float = 0.05  # m that the palm goes on after it
-    place: tuple[float, float] = (0.2, 0.31)  # m from the base: ahead, and to the side of the arm
+    peak: float = 0.86  # m, the ball's centre where the palm finds it
+    push: float = 0.2  # m that the palm stays on it
+    follow: float = 0.1  # m that the palm goes on after it
+    place: tuple[float, float] = (0.2, 0.3)  # m from the base: ahead, and to the side of the arm
     knees: float = 0.9  # rad, bent: brings the hand down
 
 
@@ -127,7 +127,7 @@ def dribble(body: RobotBody, name: str, stroke: Stroke = Stroke(), side: str = "
         reach.set_target(
             mink.SE3.from_rotation_and_translation(mink.SO3.identity(), np.array([*place, palm[k] + touch]))
         )
-        for _ in range(6):
+        for _ in range(12):
             speed = mink.solve_ik(
                 configuration, [reach, posture], 0.1, SOLVER, damping=1e-3, limits=limits, constraints=[freeze]
             )

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from policies.evaluate import FileActor
-from policies.skillmimic.evaluate import BALL_NEAR, BODY_NEAR, Result, evaluate_skill, result
+from policies.evaluate import FileActor, Rate
+from policies.skillmimic.curves import PAPER, Curve, learned, read, svg
+from policies.skillmimic.evaluate import BALL_NEAR, BODY_NEAR, Result, evaluate_skill, result, rule_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.release import graph_of
-from policies.skillmimic.through_bytes import deploy_episode
+from policies.skillmimic.tables import FIRST, NOMINAL, REST, SECOND, sweeps, switches
+from policies.skillmimic.through_bytes import BEFORE, deploy_episode
 from sim2real.contract import Contract
 from sim2real.object.camera import CameraModel
 from sim2real.policy import load_policy
-from sim2real.types import Sim2realError
 
 SECONDS = 10.0  # of an episode; that of a skill that ends by itself ends with its clip
 TARGETS = {"hold": 0.95, "raise": 0.95, "carry": 0.95, "pass": 0.85, "shot": 0.85, "pickup": 0.70, "catch": 0.70,
@@ -30,10 +32,12 @@ Tell = Callable[[str], None]
 
 
 class Evaluation(NamedTuple):
-    """What was measured of one file: way of WAYS -> label -> Result."""
+    """What was measured of one file: way of WAYS -> label -> Result; and the paper's Tables 2 and 3, or neither."""
 
     sha256: str
     results: dict[str, dict[str, Result]]
+    sweeps: dict[str, dict[str, Rate]] = {}  # label -> "radius x 0.5" -> success
+    switches: dict[str, Rate] = {}  # "first > second" -> success of the second
 
     def gap(self, label: str) -> float:
         """Success lost from training's world to the bytes with a camera."""
@@ -45,12 +49,13 @@ class Evaluation(NamedTuple):
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-able, with the interval of every rate."""
+        rate = lambda r: {**r._asdict(), "interval": r.interval}  # noqa: E731
         document: dict[str, Any] = {"sha256": self.sha256}
         for way, results in self.results.items():
-            document[way] = {
-                label: {**r._asdict(), "success": {**r.success._asdict(), "interval": r.success.interval}}
-                for label, r in results.items()
-            }
+            document[way] = {label: {**r._asdict(), "success": rate(r.success)} for label, r in results.items()}
+        if self.sweeps:
+            document["sweeps"] = {label: {k: rate(r) for k, r in row.items()} for label, row in self.sweeps.items()}
+            document["switches"] = {pair: rate(r) for pair, r in self.switches.items()}
         return document
 
 
@@ -62,20 +67,22 @@ class BallActor(FileActor):
     def signals(self, env: Any) -> dict[str, torch.Tensor]:
         return env.inputs
 
+    def begin(self, env: Any, k: int) -> None:
+        """Training starts anywhere in a clip, with a memory that fits there."""
+        self.policies[k].reset({name: carry[k].numpy() for name, carry in env.carries.items()})
 
-def evaluate(path: Path, episodes: int, deployed: int, tell: Tell = lambda text: None) -> Evaluation:
-    """Measure a policy file: ``episodes`` per skill in training's world, ``deployed`` per skill and way through the bytes.
+
+def evaluate(
+    path: Path, episodes: int, deployed: int, tell: Tell = lambda text: None, tables: bool = False
+) -> Evaluation:
+    """Measure a policy file: ``episodes`` per skill in training's world, ``deployed`` per skill and way through the bytes;
+    with ``tables``, a fifth of ``episodes`` per cell of the paper's Tables 2 and 3.
 
     Raises Sim2realError if the file is refused or was made with other settings.
     """
     torch.set_num_threads(1)
     policy = load_policy(path, trial=0)
     graph = graph_of(policy.contract)
-    if graph.base is not None:
-        raise Sim2realError(
-            f"{path}: its legs are another policy's ({graph.config.base}); how such a skill is judged through the bytes is not"
-            " written yet. Training's own measure: the success columns of its run's curve.jsonl"
-        )
     tell(f"training environment, {episodes} episodes a skill")
     actor = BallActor(path, episodes)
     results = {
@@ -83,7 +90,15 @@ def evaluate(path: Path, episodes: int, deployed: int, tell: Tell = lambda text:
         "truth": through_bytes(path, graph, deployed, None, tell),
         "camera": through_bytes(path, graph, deployed, CameraModel(), tell),
     }
-    return Evaluation(policy.sha256, results)
+    if not tables:
+        return Evaluation(policy.sha256, results)
+    each = max(1, episodes // 5)
+    return Evaluation(
+        policy.sha256,
+        results,
+        sweeps(graph, each, SECONDS, actor, tell),
+        switches(graph, each, actor, tell),
+    )
 
 
 def through_bytes(
@@ -97,14 +112,16 @@ def through_bytes(
         runs = [
             deploy_episode(path, graph, int(clips[i % len(clips)]), SECONDS, camera, seed=i) for i in range(episodes)
         ]
-        good = np.array([not r.failed for r in runs], float)
+        good = np.array([r.success for r in runs])
         results[label] = result(good, np.stack([r.sums for r in runs]), np.array([max(r.frames, 1) for r in runs]))
     return results
 
 
-def card(contract: Contract, e: Evaluation) -> str:
-    """The policy's card, Markdown."""
-    training = contract.provenance.training
+def card(
+    contract: Contract, e: Evaluation, curve: Curve | None = None, pictures: Mapping[str, str] | None = None
+) -> str:
+    """The policy's card, Markdown. ``pictures``: links to one of each skill, and to that of the "curve"."""
+    training, pictures = contract.provenance.training, pictures or {}
     rows = "\n".join(
         f"| `{label}` | {WAY_NAMES[way]} | {r.success} | {r.accuracy:.3f} | {r.body_error:.3f} | {r.ball_error:.3f} |"
         f" {r.contact_error:.3f} |"
@@ -113,10 +130,11 @@ def card(contract: Contract, e: Evaluation) -> str:
         for r in (e.results[way][label],)
     )
     verdicts = "\n".join(
-        f"- `{label}`: target {TARGETS.get(label, 0.95):.0%} through the bytes with a camera, and at most {100 * GAP:g} points"
-        f" lost on the way there: {'met' if e.good(label) else '**missed**'} ({100 * e.gap(label):+.1f} points)."
+        f"- `{label}`: {rule(label)} Target {TARGETS.get(label, 0.95):.0%} through the bytes with a camera, and at most"
+        f" {100 * GAP:g} points lost on the way there: {'met' if e.good(label) else '**missed**'} ({100 * e.gap(label):+.1f} points)."
         for label in contract.skill_labels
     )
+    films = "".join(f"![{label}]({pictures[label]})\n" for label in contract.skill_labels if label in pictures)
     return f"""# {contract.name}, ball skills for {contract.robot}
 
 Measured by `sim2real eval`; do not edit. sha256 `{e.sha256}`
@@ -124,13 +142,15 @@ Measured by `sim2real eval`; do not edit. sha256 `{e.sha256}`
 {1 / contract.period:.0f} Hz, {len(contract.target_joint_names)} joints. In: {", ".join(n for n in contract.inputs if not n.startswith("carry_"))}.
 Trained by {training.get("algorithm", "?")} ({training.get("variant", "?")}) on {float(training.get("samples", 0)) / 1e6:.1f} M samples, seed {training.get("seed", "?")}, revision {contract.provenance.revision[:12]}.
 
+{films}
 ## How well
 
-Success: {SECONDS:g} s, or the whole clip where the skill ends by itself, without a termination of the training (fallen,
-tilted, ball lost), and through the bytes without a fault of the safety gate; with 95 % confidence. Acc., E_b, E_o (m) and
-E_cg as in the paper (section 6.2), a right frame being one with the ball within {BALL_NEAR:g} m, the body within
-{BODY_NEAR:g} m and every contact right: the paper's thresholds times the robot's length scale. Robots, balls and trackers
-are drawn from randomisation that training never saw; through the bytes, bodies and balls.
+Success, with 95 % confidence, of episodes of {SECONDS:g} s, or of the whole clip and a second where a skill ends by itself; by
+each skill's own rule, which for all of them includes: no termination of the training (fallen, tilted, ball lost), and
+through the bytes no fault of the safety gate. Acc., E_b, E_o (m) and E_cg as in the paper (section 6.2), a right frame
+being one with the ball within {BALL_NEAR:g} m, the body within {BODY_NEAR:g} m and every contact right: the paper's thresholds
+times the robot's length scale. Robots, balls and trackers are drawn from randomisation that training never saw; through
+the bytes, bodies and balls.
 
 | skill | where | success | Acc. | E_b | E_o | E_cg |
 |---|---|---|---|---|---|---|
@@ -138,19 +158,115 @@ are drawn from randomisation that training never saw; through the bytes, bodies 
 
 {verdicts}
 
-Through the bytes a skill begins from its soft start, or from `{contract.default_skill}`, and not from its clip's first frame.
-A simulated person hands the ball over.
+Through the bytes a skill begins from its soft start, or from {BEFORE:g} s of `{contract.default_skill}`, and not from its clip's
+first frame. A simulated person hands the ball over, or throws it as in the clip.
+{table_2(e)}{table_3(e)}{learning(curve, pictures)}"""
+
+
+def rule(label: str) -> str:
+    """What a success of this skill is, as a sentence."""
+    return " ".join((rule_of(label).__doc__ or "").split())
+
+
+def table_2(e: Evaluation) -> str:
+    """Success with other balls, Markdown; empty if it was not measured."""
+    if not e.sweeps:
+        return ""
+    columns = list(next(iter(e.sweeps.values())))
+    rows = "\n".join(
+        f"| `{label}` | " + " | ".join(f"{row[c].value:.0%}" for c in columns) + " |" for label, row in e.sweeps.items()
+    )
+    each = next(iter(next(iter(e.sweeps.values())).values())).episodes
+    return f"""
+## Other balls (the paper's Table 2)
+
+Success in the training environment, {each} episodes a cell, of balls of {NOMINAL}, times the factor in one property; all else
+is randomised as ever. A larger ball of the same density is heavier. The paper's restitutions x 1.4 and more are left out:
+here they would return more than they got.
+
+| skill | {" | ".join(columns)} |
+|---|{"---|" * len(columns)}
+{rows}
 """
 
 
-def eval_command(file: Path, episodes: int, deployed: int, report: Path | None, card_file: Path | None) -> bool:
+def table_3(e: Evaluation) -> str:
+    """Success of one skill after another, Markdown; empty if it was not measured."""
+    if not e.switches:
+        return ""
+    rows = "\n".join(f"| `{pair}` | {rate} |" for pair, rate in e.switches.items())
+    return f"""
+## One skill after another (the paper's Table 3)
+
+Success of the second, by its rule over {SECOND:g} s, in the training environment, after {FIRST:g} s of the first (or its clip and
+{REST:g} s); of the robots that had not failed by then. Every pair of which the first ends, and the second begins, with the
+ball in both hands.
+
+| first > second | success |
+|---|---|
+{rows}
+"""
+
+
+def learning(curve: Curve | None, pictures: Mapping[str, str]) -> str:
+    """What it took, Markdown; empty if no run was given."""
+    if curve is None:
+        return ""
+    return f"""
+## What it took
+
+Success as training measures itself (few episodes, pushed), over samples; the paper spends {PAPER / 1e9:.2f} billion on a skill.
+
+![success over samples]({pictures["curve"]})
+
+{learned(curve, TARGETS)}
+"""
+
+
+def eval_command(
+    file: Path,
+    episodes: int,
+    deployed: int,
+    report: Path | None,
+    card_file: Path | None,
+    tables: bool = False,
+    runs: Sequence[Path] = (),
+    videos: Path | None = None,
+) -> bool:
     """Measure, print, write. Returns whether every skill meets its target, and keeps it on its way through the bytes."""
     from rich.console import Console
-    from rich.table import Table
 
     console = Console()
+    tell = lambda text: console.print(f"[dim]{text} ...[/]")  # noqa: E731
     contract = load_policy(file).contract
-    e = evaluate(file, episodes, deployed, tell=lambda text: console.print(f"[dim]{text} ...[/]"))
+    curve = read(runs) if runs else None
+    pictures: dict[str, str] = {}
+    if videos:  # first, so that a machine without OpenGL says so at once
+        from policies.skillmimic.film import film
+
+        graph = graph_of(contract)
+        for label in contract.skill_labels:
+            tell(f"{label}: a film")
+            gif = videos / f"{label}.gif"
+            shown = film(file, graph, label, gif)
+            console.print(f"{gif}: {f'run {shown}, the first good one' if shown else 'no good run among those tried'}")
+            pictures[label] = _link(gif, card_file)
+    e = evaluate(file, episodes, deployed, tell, tables)
+    show(console, contract, e)
+    if report:
+        report.write_text(json.dumps(e.as_dict(), indent=1) + "\n")
+    if card_file:
+        if curve is not None:
+            card_file.with_suffix(".svg").write_text(svg(curve))
+            pictures["curve"] = card_file.with_suffix(".svg").name
+        card_file.write_text(card(contract, e, curve, pictures))
+    return all(e.good(label) for label in contract.skill_labels)
+
+
+def show(console: Any, contract: Contract, e: Evaluation) -> None:
+    """Print every number."""
+    from rich.table import Table
+
     table = Table(title=f"{contract.name}: success (95 % confidence), and the paper's measures", box=None)
     for column in ("skill", "where", "success", "Acc.", "E_b m", "E_o m", "E_cg"):
         table.add_column(column)
@@ -160,8 +276,9 @@ def eval_command(file: Path, episodes: int, deployed: int, report: Path | None, 
             numbers = (f"{v:.3f}" for v in (r.accuracy, r.body_error, r.ball_error, r.contact_error))
             table.add_row(label, WAY_NAMES[way], str(r.success), *numbers)
     console.print(table)
-    if report:
-        report.write_text(json.dumps(e.as_dict(), indent=1) + "\n")
-    if card_file:
-        card_file.write_text(card(contract, e))
-    return all(e.good(label) for label in contract.skill_labels)
+    for text in (table_2(e), table_3(e)):
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _link(file: Path, card_file: Path | None) -> str:
+    return os.path.relpath(file, card_file.parent if card_file else ".")

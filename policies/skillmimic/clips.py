@@ -10,17 +10,19 @@ import numpy as np
 
 from policies import ball
 from policies.clips.format import Clip, ClipError
-from policies.clips.kinematics import rate
+from policies.clips.kinematics import conjugate, rate, rotate
 from policies.clips.library import robot_clips
 from policies.clips.resample import resample
 from policies.clips.robot import POINT_NAMES, RobotBody
 from policies.contact_graph import ContactGraph, reference_edges
 from policies.skillmimic.config import SkillMimic
+from policies.skillmimic.plan import Rows
 from policies.skillmimic.rewards import Motion
 from policies.skillmimic.stance import crouched, stand, trunk
 from policies.skillmimic.world import hands
 
 GRAVITY = 9.81  # m/s^2
+SINGULAR = 0.08  # m/rad: damps the way back from palms to joints where an arm is stretched
 PRESS = 0.004  # m the palms start inside the ball, so that they carry it from the first step on
 
 
@@ -73,6 +75,8 @@ class ReferenceClips:
                 for i in mine:
                     clips[i] = stand(clips[i], body, self.stances[k], height)
         fine = [resample(clip, 1 / config.timestep) for clip in clips]
+        self.hands = np.array([c.contact[:, :2].any(axis=0) for c in clips])  # (clips, 2): which ever touch the ball
+        self._config, self._model, self._body = config, model, body
         self.names = [clip.name for clip in clips]
         self.length = np.array([len(c) for c in fine])
         self.first = np.cumsum([0, *self.length[:-1]])
@@ -91,6 +95,7 @@ class ReferenceClips:
             [m.points_velocity[:, 0], spin, m.joint_vel, m.object_velocity, np.zeros((count, 3))], axis=1
         )
         self.target = joints + effort
+        self._lag = body.robot.home_kd / kp  # s that a motor's damping keeps it behind its target
 
     def sample(self, rng: np.random.Generator, k: int, skills: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
         """(k,) clips and (k,) rows into them: every skill (of ``skills``, by index) as often, then every clip of it, then
@@ -125,6 +130,39 @@ class ReferenceClips:
             object_velocity=m.object_velocity * way[:, None],
         )
 
+    def plan(self, skill: int, acting: Sequence[int], pull: float) -> Rows:
+        """What the arms, joints ``acting`` by index, do in a skill by its first clip; one row for a clip that plays to and
+        fro. ``pull``: see ``plan.Rows``; a ball in the hands has no say in the time."""
+        clip = int(np.flatnonzero(self.skill == skill)[0])
+        every = round(self._config.period / self._config.timestep)
+        at = self.first[clip] + np.arange(0, self.length[clip], every)
+        m, gone = self._motion, self._gone(clip, at)
+        turn = conjugate(m.orientation_base_in_world[at])
+        ball_in_base = rotate(turn, m.object_position[at] - m.points[at, 0])
+        velocity = rotate(turn, m.object_velocity[at] - m.points_velocity[at, 0])
+        target = (self.target[at] + self._lag * m.joint_vel[at])[:, acting]
+        pulls = pull * (m.contact[at, 0] == 0)
+        if self.swing[clip]:
+            target, ball_in_base = self.mean(skill)[0][None, acting], ball_in_base.mean(axis=0, keepdims=True)
+            velocity, pulls = np.zeros((1, 3)), np.zeros(1)
+        data, back = mujoco.MjData(self._model), np.zeros((len(target), len(acting), 3))
+        for t in range(len(target)):
+            if gone[t]:
+                continue
+            data.qpos[:] = self.qpos[at[t]]
+            mujoco.mj_kinematics(self._model, data)
+            mujoco.mj_comPos(self._model, data)
+            for site in self._body.palms[self.hands[clip]]:
+                link = self._model.site_bodyid[site]
+                jacobian = _jacobian(self._model, data, data.site_xpos[site], link)[:, acting]
+                back[t] += jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + SINGULAR**2 * np.eye(3))
+        return Rows(target, ball_in_base, velocity, back, bool(self.loop[clip]), pulls)
+
+    def _gone(self, clip: int, at: np.ndarray) -> np.ndarray:
+        """(rows,) bool: whether the ball has left the hands for good."""
+        held = self._motion.contact[at, 0] > 0
+        return ~np.maximum.accumulate(held[::-1])[::-1] & ~self.loop[clip]
+
     def mean(self, skill: int) -> tuple[np.ndarray, np.ndarray]:
         """Of one skill, every clip counting alike: mean target (n,) rad, and mean gravity in the base (3,)."""
         chosen = np.flatnonzero(self.skill == skill)
@@ -136,9 +174,13 @@ class ReferenceClips:
 
 
 def grip(clip: Clip, model: mujoco.MjModel, body: RobotBody, kp: np.ndarray, force: float) -> Grip:
-    """Statics of every frame: the robot's weight on the standing feet, and the ball's on the holding palms, which press
-    it with ``force`` N each where both are on it."""
+    """Forces of every frame: the robot's weight on the standing feet, what moves the arms, and what moves and bears the
+    ball on the holding palms, which press it with ``force`` N each where both are on it."""
     data = mujoco.MjData(model)
+    speeds = np.zeros((len(clip), model.nv))
+    speeds[:, 6:-6] = clip.joint_vel * np.array([j.group == "arm" for j in body.robot.joints])
+    accelerations = rate(speeds, clip.fps)
+    push = ball.MASS * (rate(clip.ball_velocity_in_world, clip.fps) + [0.0, 0.0, GRAVITY])  # (T, 3) N on the ball
     arms = np.array([j.group == "arm" for j in body.robot.joints])
     robot = model.body(body.robot.base).id
     palms, feet = (list(zip(ids, model.site_bodyid[ids], strict=True)) for ids in (body.palms, body.feet))
@@ -150,6 +192,12 @@ def grip(clip: Clip, model: mujoco.MjModel, body: RobotBody, kp: np.ndarray, for
         mujoco.mj_comPos(model, data)
         mujoco.mj_rne(model, data, 0, data.qfrc_bias)
         torque = data.qfrc_bias[6:-6].copy()
+        data.qvel[:], data.qacc[:] = speeds[t], accelerations[t]
+        mujoco.mj_fwdVelocity(model, data)
+        mujoco.mj_rne(model, data, 1, data.qfrc_bias)
+        moving = data.qfrc_bias + model.dof_armature * accelerations[t]
+        torque = np.where(arms, moving[6:-6], torque)
+        data.qvel[:] = 0.0
         mass, centre = float(model.body_subtreemass[robot]), data.subtree_com[robot].copy()
         holding = [palm for palm, on in zip(palms, clip.contact[t, :2], strict=True) if on]
         standing = [foot for foot, on in zip(feet, clip.contact[t, 2:], strict=True) if on]
@@ -160,7 +208,7 @@ def grip(clip: Clip, model: mujoco.MjModel, body: RobotBody, kp: np.ndarray, for
             if len(holding) == 2:
                 torque += jacobian.T @ (force * towards)
                 press[t] += np.linalg.pinv(jacobian * arms, rcond=1e-2) @ (PRESS * towards)
-            torque += jacobian.T @ [0, 0, -ball.MASS * GRAVITY / len(holding)]
+            torque -= jacobian.T @ (push[t] / len(holding))
         if holding:
             centre = (mass * centre + ball.MASS * clip.ball_position_in_world[t]) / (mass + ball.MASS)
             mass += ball.MASS

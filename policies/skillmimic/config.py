@@ -25,6 +25,11 @@ class SkillMimic:
     # Who moves the legs: a checkpoint of the basics, which goes into the policy as it is, and the actor moves the arms. None:
     # the actor moves every joint, as in the paper.
     base: str | None = None
+    corrections: str | None = None  # of the plan of the arms (plan.py), a file; only with a base
+    timed: tuple[str, ...] = (
+        "catch",
+        "dribble_in_place",
+    )  # skills in which the ball, and not the clock, says how far on
     walks: tuple[str, ...] = ()  # skills during which the base obeys velocity commands
     still: float = 0.3  # share of their episodes without any
     # the policy
@@ -35,7 +40,7 @@ class SkillMimic:
     action_ratio: float = 0.25  # action 1 moves the target by this share of torque / kp
     action_max: float = 6.0
     grip: float = (
-        25.0  # N each palm presses, where the clip has both on the ball: inside the posture actions start from
+        40.0  # N each palm presses, where the clip has both on the ball: inside the posture actions start from
     )
     balance_gain: float = 2.3  # rad of ankle per rad of pitch away from the skill's own; 0 for skills that walk
     balance_damping: float = 0.25  # rad per rad/s
@@ -45,6 +50,9 @@ class SkillMimic:
     timestep: float = 0.005  # s of the physics
     frames: int = 60  # ticks in an episode, as in the paper: 1.2 s here, 1.4 s of the recorded motion
     disturbed: float = 0.5  # share of episodes that start beside their reference frame
+    throw: float = (
+        0.1  # m/s, the most by which a ball that flies at the start does so otherwise than in the clip, each way
+    )
     push_chance: float = 0.01  # a tick
     push_speed: float = 0.3  # m/s, the largest
     terminations: tuple[str, ...] = ("fallen", "tilted", "ball_lost", "broken")
@@ -75,15 +83,15 @@ class SkillMimic:
 
 
 BASE = "policies/g1/basics.pt"
-BALL = {
-    **{
-        skill: [f"{skill}_{k:02d}" for k in range(1, 1 + n)]
-        for skill, n in (("hold", 7), ("carry", 4), ("pass", 3), ("catch", 7))
-    },
-    "dribble_in_place": ["dribble_in_place_01"],
+BALL = {  # a clip each: the calmest, and those that come from and go to the front
+    "hold": "hold_01",
+    "carry": "carry_01",
+    "pass": "pass_02",
+    "catch": "catch_03",
+    "dribble_in_place": "dribble_in_place_01",
 }
 TASKS: dict[str, SkillMimic] = {
-    "g1-ball": SkillMimic(base=BASE, skills=tuple(BALL), clips=tuple(clip for clips in BALL.values() for clip in clips),
+    "g1-ball": SkillMimic(base=BASE, corrections="policies/g1/plan.yaml", skills=tuple(BALL), clips=tuple(BALL.values()),
                           walks=("carry",), frames=150),
     "g1-pickup": SkillMimic(clips=(), skills=("pickup",), balance_gain=0.0, balance_damping=0.0, samples=100e6),
 }  # fmt: skip

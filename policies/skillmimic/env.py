@@ -24,7 +24,7 @@ from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.observations import observe
 from policies.skillmimic.randomisation import LOSS_TICKS, Randomisation
 from policies.skillmimic.rewards import SENSITIVITIES, Motion, Step, reward
-from policies.skillmimic.stance import ARM_POINTS
+from policies.skillmimic.stance import arms, moved
 from policies.skillmimic.terminations import failed, up
 
 BASE, JOINTS, BALL = slice(0, 7), slice(7, -7), slice(-7, -4)  # of qpos
@@ -56,6 +56,8 @@ class Env(VecEnv):
         self.substeps = round(config.period / config.timestep)
         self.batch = Batch(self.model, n, config.threads)
         self.random = Randomisation(self.batch, self.model)
+        timed = np.array([name in config.timed for name in config.skills])
+        self._timed = timed[self.clips.skill]  # whose clock is the plan's
         self._ends = ~(self.clips.swing | self.clips.loop)
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._anchors, self._sites = self.batch.bind("xanchor"), self.batch.bind("site_xpos")
@@ -68,6 +70,7 @@ class Env(VecEnv):
             "sensordata": np.zeros((n, self.substeps, self.model.nsensordata)),
         }
         self.clip, self.row = np.zeros(n, np.intp), np.zeros(n, np.intp)  # what is imitated, and how far it is
+        self._begun = np.zeros(n, np.intp)  # where in the clip an episode started
         self.skill, self.command = torch.zeros(n, len(self.graph.labels)), torch.zeros(n, 3)
         self.carries = {k: torch.zeros(n, *v) for k, v in self.graph.inputs().items() if k.startswith("carry_")}
         self.action, self.target = torch.zeros(n, self.num_actions), torch.zeros(n, joints)
@@ -105,7 +108,8 @@ class Env(VecEnv):
         rewards[~np.isfinite(rewards)] = 0.0
         self.episode_length_buf += 1
         over = self.episode_length_buf.numpy() >= self.max_episode_length
-        beyond = self.row - self.clips.length[self.clip] + 1  # physics steps past the end of a clip that has one
+        since = self._begun + self.episode_length_buf.numpy() * self.substeps
+        beyond = since - self.clips.length[self.clip] + 1  # physics steps past the end of a clip that has one
         over |= self._ends[self.clip] & (beyond * self.config.timestep >= self.config.after)
         timeouts = over & ~self.failures
         self._push()
@@ -153,6 +157,9 @@ class Env(VecEnv):
             out=self._recorded,
         )
         self.row += self.substeps
+        if self.graph.plan is not None:
+            clock = self.carries["carry_clock"][:, 0].numpy()
+            self.row = np.where(self._timed[self.clip], np.round(clock * self.substeps).astype(int), self.row)
 
     def _judge(self, action_change: np.ndarray) -> Step:
         """The state and its reference, one physics step before now."""
@@ -177,39 +184,22 @@ class Env(VecEnv):
         self.apart = np.linalg.norm(qpos[:, BALL] - qpos[:, :3], axis=1)
         upright = up(qpos[:, 3:7]), up(reference.orientation_base_in_world)
         if self.graph.base is not None:
-            state, acceleration = self._arms(self._standing(state, qvel)), acceleration[:, self.graph.acting]
+            trunk, stance = (self._bodies[:, self._trunk], self._turns[:, self._trunk]), self.clips.skill[self.clip]
+            there = self.clips.trunk_position[stance], self.clips.trunk_orientation[stance]
+            state = arms(moved(state, qvel, trunk, there), self.graph.acting)
+            acceleration = acceleration[:, self.graph.acting]
         away = lambda there, here: np.where(gone[:, None], here, there)  # noqa: E731
         reference = reference._replace(
             object_position=away(reference.object_position, state.object_position),
             object_velocity=away(reference.object_velocity, state.object_velocity),
         )
-        return Step(state, reference, acceleration, action_change, qpos[:, 2], *upright)
+        bounces = self.clips.loop[self.clip]
+        return Step(state, reference, acceleration, action_change, qpos[:, 2], *upright, bounces)
 
     def reference(self, rows: np.ndarray, way: np.ndarray) -> Motion:
         """What is imitated at table ``rows`` (N,), as ``_judge`` sees states."""
         motion = self.clips.motion(rows, way)
-        return motion if self.graph.base is None else self._arms(motion)
-
-    def _arms(self, m: Motion) -> Motion:
-        """All that an actor can help who moves nothing but the arms."""
-        points, level = m.points[:, 1 + ARM_POINTS], np.tile([1.0, 0, 0, 0], (len(m.points), 1))
-        acting = self.graph.acting
-        return Motion(points, np.zeros_like(points), level, m.joint_pos[:, acting], m.joint_vel[:, acting],
-                      m.object_position, m.object_velocity, m.contact)  # fmt: skip
-
-    def _standing(self, m: Motion, qvel: np.ndarray) -> Motion:
-        """``m`` moved to where its trunk is that of the skill's stance, in which its clips are."""
-        stance = self.clips.skill[self.clip]
-        here, facing = self.clips.trunk_position[stance], self.clips.trunk_orientation[stance]
-        there = self._bodies[:, self._trunk]
-        turn = multiply(facing, conjugate(self._turns[:, self._trunk]))
-        base, spin = m.points[:, 0], rotate(m.orientation_base_in_world, qvel[:, SPIN])
-        drift = qvel[:, :3] + np.cross(spin, there - base)
-        return m._replace(
-            points=here[:, None] + rotate(turn[:, None], m.points - there[:, None]),
-            object_position=here + rotate(turn, m.object_position - there),
-            object_velocity=rotate(turn, m.object_velocity - drift),
-        )
+        return motion if self.graph.base is None else arms(motion, self.graph.acting)
 
     def _observe(self) -> None:
         """Measure every robot; what its actor sees this tick, and what only the critic sees."""
@@ -311,8 +301,11 @@ class Env(VecEnv):
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         clip, row = self.clips.sample(rng, k, self.skills)
         self.clip[ids], self.row[ids] = clip, row if self.config.anywhere else 0
+        self._begun[ids] = self.row[ids]
         rows, _ = self.clips.rows(self.clip[ids], self.row[ids])
         qpos, qvel = self.clips.qpos[rows].copy(), self.clips.qvel[rows].copy()
+        flies = self.clips.motion(rows, np.ones(k)).contact[:, :1] == 0
+        qvel[:, FLIGHT] += flies * rng.uniform(-self.config.throw, self.config.throw, (k, 3))
         self._disturb(qpos, qvel, rng.random(k) < self.config.disturbed)
         self._qpos[ids], self._qvel[ids] = qpos, qvel
         self._recorded["qpos"][ids], self._recorded["qvel"][ids] = qpos[:, None], qvel[:, None]
@@ -322,7 +315,12 @@ class Env(VecEnv):
         self.action[ids] = 0.0
         for carry in self.carries.values():
             carry[ids] = 0.0
-        if self.graph.base is not None:  # whose arms are where they are sent
+        if self.graph.base is not None:
+            self.carries["carry_skill"][ids] = self.skill[ids]
+            self.carries["carry_clock"][ids] = _tensor(
+                np.where(self.clips.swing[clip], 0.0, self.row[ids] / self.substeps)[:, None]
+            )
+            # whose arms are where they are sent
             self.carries["carry_base_posture"][ids] = torch.where(
                 self.graph.acts > 0, self.target[ids], _tensor(self.clips.stances[self.clips.skill[self.clip[ids]]])
             )

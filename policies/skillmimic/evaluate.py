@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 from policies.evaluate import UNSEEN, Rate
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.randomisation import TABLE
 from policies.skillmimic.rewards import Step
 
 # The paper's thresholds of a right frame, times the robot's length scale of 0.744: ball within 0.2 m, body within 0.1 m.
@@ -37,63 +39,78 @@ def measure(s: Step) -> Measures:
 
 
 class Trace(NamedTuple):
-    """What happened in an episode, arrays (T, N, ...): seen from the trunk where a base policy moves the legs, else in the
-    world."""
+    """What happened in an episode, a row a tick until it ended: seen from the trunk where a base policy moves the legs,
+    else in the world."""
 
-    held: np.ndarray  # bool: hands touch the ball
-    ball: np.ndarray  # (T, N, 3) m
-    ball_velocity: np.ndarray  # (T, N, 3) m/s
-    apart: np.ndarray  # m between ball and base
-    height: np.ndarray  # m of the base
-    up: np.ndarray  # bool: no episode failed up to here
+    held: np.ndarray  # (T,) bool: hands touch the ball
+    ball_velocity: np.ndarray  # (T, 3) m/s
+    apart: np.ndarray  # (T,) m between ball and base
+    height: np.ndarray  # (T,) m of the base
+    up: np.ndarray  # (T,) bool: nothing failed up to here
 
 
 LENGTH = 0.745  # of the G1, over a person's: distances of the paper's rules times this
 ASIDE, LEAST = np.deg2rad(20.0), 1.5  # rad off the commanded direction, and m/s forwards, of a ball that was thrown
 HELD = 0.5  # s at the end of an episode during which a caught ball is held
+LIVELY = 2.0  # s after its last touch for which a ball is being dribbled
 
 
-def _kept(t: Trace, period: float) -> np.ndarray:
+def _kept(t: Trace, period: float, ticks: int) -> float:
     """Nothing failed: the robot stands, and the ball stays near where the clip has it."""
-    return t.up[-1].astype(float)
+    return float(t.up[-1])
 
 
-def _thrown(t: Trace, period: float) -> np.ndarray:
+def _thrown(t: Trace, period: float, ticks: int) -> float:
     """The ball left the hands for good, forwards (to 20 degrees) at 1.5 m/s or more, and the robot stands at the end."""
-    good = t.up[-1].copy()
-    for n in range(t.held.shape[1]):
-        last = np.flatnonzero(t.held[:, n])
-        free = last[-1] + 2 if len(last) else 0  # a tick later nothing touches it
-        if free >= len(t.held):
-            good[n] = False
-            continue
-        forward, left = t.ball_velocity[free, n, :2]
-        good[n] &= forward >= LEAST and abs(np.arctan2(left, forward)) <= ASIDE
-    return good.astype(float)
+    last = np.flatnonzero(t.held)
+    free = last[-1] + 2 if len(last) else 0  # a tick later nothing touches it
+    if free >= len(t.held):
+        return 0.0
+    forward, left = t.ball_velocity[free, :2]
+    return float(t.up[-1] and forward >= LEAST and abs(np.arctan2(left, forward)) <= ASIDE)
 
 
-def _caught(t: Trace, period: float) -> np.ndarray:
+def _caught(t: Trace, period: float, ticks: int) -> float:
     """The robot stands, and holds the ball during the last half second."""
-    return (t.up[-1] & t.held[-round(HELD / period) :].all(axis=0)).astype(float)
+    return float(t.up[-1] and t.held[-round(HELD / period) :].all())
 
 
-def _dribbled(t: Trace, period: float) -> np.ndarray:
+def _dribbled(t: Trace, period: float, ticks: int) -> float:
     """Section 6.2: the share of frames with base above 0.5 m and ball nearer than 1.5 m, at the robot's size; frames after
     a failure do not count, nor those more than 2 s after the last touch."""
-    frames = np.arange(len(t.held))[:, None]
-    touched = np.maximum.accumulate(np.where(t.held, frames, 0), axis=0)
-    lively = (frames - touched) * period < 2.0
-    return (t.up & lively & (t.height > 0.5 * LENGTH) & (t.apart < 1.5 * LENGTH)).mean(axis=0)
+    frames = np.arange(len(t.held))
+    touched = np.maximum.accumulate(np.where(t.held, frames, 0))
+    lively = (frames - touched) * period < LIVELY
+    return float((t.up & lively & (t.height > 0.5 * LENGTH) & (t.apart < 1.5 * LENGTH)).sum() / ticks)
 
 
-RULES: dict[str, Callable[[Trace, float], np.ndarray]] = {
+RULES: dict[str, Callable[[Trace, float, int], float]] = {
     "pass": _thrown,
     "shot": _thrown,
     "catch": _caught,
     "dribble_in_place": _dribbled,
     "dribble_forward": _dribbled,
 }
-"""Success of an episode in [0, 1] by skill; of every other skill: ``_kept``."""
+"""Success in [0, 1] of an episode of ``ticks``, had nothing failed, by skill; of every other skill: ``_kept``."""
+
+
+def rule_of(skill: str) -> Callable[[Trace, float, int], float]:
+    """What counts as a success of ``skill``."""
+    return RULES.get(skill, _kept)
+
+
+def succeeded(skill: str, trace: Trace, period: float, ticks: int) -> float:
+    """By the skill's rule."""
+    return rule_of(skill)(trace, period, ticks)
+
+
+def ticks_of(graph: PolicyGraph, clip: int, seconds: float) -> int:
+    """Of an episode of ``seconds`` from the beginning of clip number ``clip``; where that ends, at most ``config.after`` s
+    beyond."""
+    clips, config = graph.clips, graph.config
+    if not (clips.swing[clip] or clips.loop[clip]):
+        seconds = min(seconds, (clips.length[clip] - 1) * config.timestep + config.after)
+    return math.ceil(seconds / config.period - 1e-6)
 
 
 class Result(NamedTuple):
@@ -138,8 +155,38 @@ def evaluate_skill(
     push: float = 0.0,
     seed: int = 0,
     act: Callable[[Env], Tensor] | None = None,
+    fixed: Mapping[str, float] | None = None,
 ) -> Result:
-    """As ``evaluate``, of one skill."""
+    """As ``evaluate``, of one skill. ``fixed``: terms of the randomisation that have one value instead."""
+    env = episodes_of(graph, skill, episodes, seconds, push, seed)
+    config = env.config
+    if fixed:
+        env.random.table = TABLE | {name: TABLE[name]._replace(low=x, high=x) for name, x in fixed.items()}
+        env.reset()
+        env.episode_length_buf[:] = 0
+    act = act or (lambda e: graph.actor(e.observation))
+    running, up = np.full(episodes, True), np.full(episodes, True)
+    sums, frames, clips = np.zeros((episodes, len(Measures._fields))), np.zeros(episodes, int), env.clip.copy()
+    rows: list[Trace] = []
+    with torch.no_grad():
+        while running.any():
+            _, _, dones, _ = env.step(act(env))
+            up = up & ~(running & env.failures)
+            rows.append(traced(env, up))
+            sums[running] += np.stack(measure(env.now), axis=1)[running]
+            frames += running
+            running &= ~dones.numpy().astype(bool)
+    everything = Trace(*(np.stack(values) for values in zip(*rows, strict=True)))
+    shares = [
+        succeeded(skill, Trace(*(x[:end, n] for x in everything)), config.period, ticks_of(graph, clips[n], seconds))
+        for n, end in enumerate(frames)
+    ]
+    return result(np.array(shares), sums, frames)
+
+
+def episodes_of(graph: PolicyGraph, skill: str, episodes: int, seconds: float, push: float = 0.0, seed: int = 0) -> Env:
+    """An environment in which every robot begins an episode of ``skill``: at the beginning of a clip, where its rule needs
+    that."""
     config = dataclasses.replace(
         graph.config,
         envs=episodes,
@@ -151,28 +198,10 @@ def evaluate_skill(
     )
     env = Env(config, UNSEEN + seed, graph, skill)
     env.episode_length_buf[:] = 0
-    act = act or (lambda e: graph.actor(e.observation))
-    running, up = np.full(episodes, True), np.full(episodes, True)
-    sums, frames = np.zeros((episodes, len(Measures._fields))), np.zeros(episodes)
-    rows: list[Trace] = []
-    with torch.no_grad():
-        while running.any():
-            _, _, dones, _ = env.step(act(env))
-            up = up & ~(running & env.failures)
-            state, row = env.now.state, measure(env.now)
-            now = Trace(state.contact[:, 0] > 0, state.object_position, state.object_velocity, env.apart,
-                        env.now.height, up)  # fmt: skip
-            if rows:  # an episode that is over stays as it ended
-                now = Trace(*(np.where(_like(running, new), new, old) for new, old in zip(now, rows[-1], strict=True)))
-            rows.append(now)
-            sums[running] += np.stack(row, axis=1)[running]
-            frames += running
-            running &= ~dones.numpy().astype(bool)
-    rows += rows[-1:] * (config.frames - len(rows))
-    trace = Trace(*(np.stack(values) for values in zip(*rows, strict=True)))
-    shares = RULES.get(skill, _kept)(trace, config.period)
-    return result(shares, sums, frames)
+    return env
 
 
-def _like(chosen: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return chosen.reshape(-1, *[1] * (values.ndim - 1))
+def traced(env: Env, up: np.ndarray) -> Trace:
+    """This tick of every robot; ``up`` (envs,) bool: nothing failed so far."""
+    state = env.now.state
+    return Trace(state.contact[:, 0] > 0, state.object_velocity, env.apart, env.now.height, up)

@@ -15,11 +15,14 @@ from policies.observations import observe as observe_base
 from policies.skillmimic.clips import ReferenceClips
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.observations import Signals, observe, present
+from policies.skillmimic.plan import Plan
+from policies.skillmimic.plan import read as corrections
 from policies.skillmimic.world import training_world
 from policies.train import graph_of
 from sim2real.config import RobotConfig, load_robot
 
 ROOT = Path(__file__).resolve().parents[2]
+PULL = 12.0  # rows of the plan, per tick, per s that the ball is ahead of it
 
 
 class PolicyGraph(nn.Module):
@@ -40,6 +43,7 @@ class PolicyGraph(nn.Module):
     acts: Tensor
     poses: Tensor
     walks: Tensor
+    spread: Tensor
     lower: Tensor
     upper: Tensor
 
@@ -68,6 +72,14 @@ class PolicyGraph(nn.Module):
         self.register_buffer("drive", _buffer(np.diag(scale)[self.acting]))  # actions to joints
         self.register_buffer("ankles", _buffer(np.array(["ankle_pitch" in name for name in robot.joint_names])))
         self.register_buffer("acts", _buffer(acts))
+        self.plan: Plan | None = None
+        if self.base is not None:
+            rows = [
+                self.clips.plan(k, self.acting, PULL * (name in config.timed)) for k, name in enumerate(self.labels)
+            ]
+            file = ROOT / (config.corrections or "none")
+            self.plan = Plan(rows, corrections(file, self.labels, len(self.acting)))
+            self.register_buffer("spread", _buffer(np.eye(len(acts))[self.acting]))  # arms to joints
         self.register_buffer("poses", _buffer(self.clips.stances - robot.home_pos))  # (skills, n), of the base
         self.register_buffer("walks", _buffer(np.array([[skill in config.walks] for skill in config.skills])))
         self.register_buffer("lower", _buffer(robot.position_min + config.position_margin))
@@ -94,7 +106,7 @@ class PolicyGraph(nn.Module):
 
     def carries(self, signals: Signals, action: Tensor) -> dict[str, Tensor]:
         """What the next tick has to be told of this one."""
-        return {"carry_action": action, "carry_history": self.remember(signals), **signals.base}
+        return {"carry_action": action, "carry_history": self.remember(signals), **signals.carried}
 
     def carry_start(self) -> dict[str, list[float]]:
         """What each carried tensor is before the first tick; an empty list is zeros."""
@@ -116,13 +128,14 @@ class PolicyGraph(nn.Module):
             "object_velocity_in_base": [3],
             "carry_action": [len(self.acting)],
             "carry_history": [self.history],
+            **({} if self.base is None else {"carry_skill": [len(self.labels)], "carry_clock": [1]}),
             **{_of_base(name): shape for name, shape in base.items() if name.startswith("carry_")},
         }
 
     def outputs(self) -> dict[str, list[int]]:
         """Every output by name with its shape, without the batch axis, in the order of ``forward``."""
         n, actions = len(self.joint_names), len(self.acting)
-        size = self.history // self.config.history + n + 3 + actions + len(self.labels) + self.history
+        size = self.history // self.config.history + n + 3 + actions + len(self.labels) + 7 + self.history
         return {
             "joint_pos_target": [n],
             **{f"{name}_next": shape for name, shape in self.inputs().items() if name.startswith("carry_")},
@@ -136,12 +149,17 @@ class PolicyGraph(nn.Module):
         orientation, gyro, skill = (
             inputs[n] for n in ("orientation_base_in_world", "angular_velocity_base_in_base", "skill")
         )
+        ball = torch.cat([inputs["object_position_in_base"], inputs["object_velocity_in_base"]], dim=-1)
         posture, gravity, carried = skill @ self.postures, gravity_in_base(orientation), {}
-        if self.base is None:
+        if self.base is None or self.plan is None:
+            planned = torch.zeros(len(skill), 7)
             config = self.config
             ankle = config.balance_gain * (gravity[:, 0:1] - skill @ self.lean) + config.balance_damping * gyro[:, 1:2]
             rest = posture + self.ankles * ankle
         else:
+            plan = self.plan(skill, inputs["carry_skill"], inputs["carry_clock"], ball)
+            planned = torch.cat([plan.ball_error, plan.clock / self.plan.longest], dim=-1)
+            posture = plan.target @ self.spread
             # The base sees the arms on their way to where they were last sent.
             hands = self.acts * (posture - self.base.home) + inputs["carry_action"] @ self.drive
             pose = skill @ self.poses * (1 - self.acts) + hands
@@ -152,10 +170,11 @@ class PolicyGraph(nn.Module):
             seen = self.base.advance(*joints, orientation, gyro, command, walk, **given, pose=pose)
             action = self.base.clip(self.base.actor(observe_base(seen)))
             rest = torch.where(self.acts > 0, posture, self.base.target(seen, action))
-            carried = {_of_base(name): value for name, value in self.base.carries(seen, action).items()}
+            carried = {"carry_skill": skill + 0.0, "carry_clock": plan.clock}
+            carried |= {_of_base(name): value for name, value in self.base.carries(seen, action).items()}
         return Signals(*joints, gravity, gyro, skill, inputs["object_position_in_base"],
-                       inputs["object_velocity_in_base"], rest, inputs["carry_action"], inputs["carry_history"],
-                       carried)  # fmt: skip
+                       inputs["object_velocity_in_base"], rest, planned, inputs["carry_action"],
+                       inputs["carry_history"], carried)  # fmt: skip
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """One tick of a batch of one: the tensors of ``inputs()``, in that order, to those of ``outputs()``."""

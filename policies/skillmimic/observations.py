@@ -20,9 +20,10 @@ class Signals(NamedTuple):
     object_position_in_base: Tensor  # m
     object_velocity_in_base: Tensor  # m/s
     rest: Tensor  # (N, n) rad, what actions are added to: the skill's posture, or what the base does
+    planned: Tensor  # (N, 7): m and m/s of the ball from where the plan has it, and the share of the plan that is over
     last_action: Tensor  # (N, actions)
     history: Tensor  # (N, ticks * size of PRESENT), newest first
-    base: dict[str, Tensor]  # what the base policy carries on, by name
+    carried: dict[str, Tensor]  # what plan and base policy carry on, by name
 
 
 class Term(NamedTuple):
@@ -42,6 +43,7 @@ TERMS: dict[str, Term] = {
     **PRESENT,
     "joint_vel": Term(0.3, lambda s: s.joint_vel),
     "object_velocity_in_base": Term(0.5, lambda s: s.object_velocity_in_base),
+    "planned": Term(2.0, lambda s: s.planned),
     "last_action": Term(1.0, lambda s: s.last_action),
     "skill": Term(1.0, lambda s: s.skill),
     "history": Term(1.0, lambda s: s.history),

@@ -86,9 +86,10 @@ EXPANDED = ("geom_friction", "body_mass", "body_inertia", "body_ipos", "actuator
 
 
 class Randomisation:
-    """Draws the table for the simulations of a batch. ``drawn[name]``: (sims, size)."""
+    """Draws the table for the simulations of a batch. ``drawn[name]``: (sims, size). ``table`` may be changed between draws."""
 
     def __init__(self, batch: Batch, model: mujoco.MjModel) -> None:
+        self.table = TABLE
         self._batch, self._model = batch, model
         self._fields = {field: batch.expand(field) for field in EXPANDED}
         sizes = {"joints": model.nu, "bodies": model.nbody}
@@ -97,7 +98,7 @@ class Randomisation:
 
     def draw(self, ids: np.ndarray, rng: np.random.Generator) -> None:
         """New robots, balls and trackers in the simulations ``ids`` (k,)."""
-        for name, term in TABLE.items():
+        for name, term in self.table.items():
             x = rng.uniform(term.low, term.high, (len(ids), self._sizes[name]))
             self.drawn[name][ids] = x
             if term.apply:

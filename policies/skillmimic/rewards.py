@@ -67,6 +67,7 @@ class Step(NamedTuple):
     height: np.ndarray  # (N,) m, of the base
     up: np.ndarray  # (N,) cosine of its tilt
     up_reference: np.ndarray  # (N,)
+    bounces: np.ndarray  # (N,) bool: the ball is to stay where it is, going up and down
 
 
 def _mean_square(error: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ knees bend is taken from the height of the clip's base.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import mujoco
@@ -16,8 +17,10 @@ from policies.clips.format import Clip
 from policies.clips.kinematics import conjugate, multiply, rate, rotate
 from policies.clips.robot import POINT_NAMES, RobotBody
 from policies.physics import standing_height
+from policies.skillmimic.rewards import Motion
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+Place = tuple[np.ndarray, np.ndarray]  # positions (N, 3) m and orientations (N, 4), in the world
 ARM_POINTS = np.array([k for k, name in enumerate(POINT_NAMES) if name.endswith(("shoulder", "elbow", "palm"))])
 
 
@@ -62,6 +65,28 @@ def stand(clip: Clip, body: RobotBody, pose: np.ndarray, height: float) -> Clip:
         ball_position_in_world=here + rotate(turn, clip.ball_position_in_world - there),
         ball_velocity_in_world=rotate(turn, clip.ball_velocity_in_world - rate(there, clip.fps)),
         contact=np.column_stack([clip.contact[:, :2], np.ones((len(clip), 2), bool)]),
+    )
+
+
+def arms(m: Motion, acting: Sequence[int]) -> Motion:
+    """All of ``m`` that an actor can help who moves nothing but the arms: the joints ``acting``, by index."""
+    points, level = m.points[:, 1 + ARM_POINTS], np.tile(LEVEL, (len(m.points), 1))
+    return Motion(points, np.zeros_like(points), level, m.joint_pos[:, acting], m.joint_vel[:, acting],
+                  m.object_position, m.object_velocity, m.contact)  # fmt: skip
+
+
+def moved(m: Motion, qvel: np.ndarray, trunk: Place, there: Place) -> Motion:
+    """Points and object of ``m``, whose base has velocities ``qvel`` (N, >= 6) as MuJoCo has them, moved to where its
+    ``trunk`` is ``there``: that of the skill's stance, in which its clips are. The object's velocity is then relative to a
+    trunk that does not turn."""
+    (position, orientation), (here, facing) = trunk, there
+    turn = multiply(facing, conjugate(orientation))
+    base, spin = m.points[:, 0], rotate(m.orientation_base_in_world, qvel[:, 3:6])
+    drift = qvel[:, :3] + np.cross(spin, position - base)
+    return m._replace(
+        points=here[:, None] + rotate(turn[:, None], m.points - position[:, None]),
+        object_position=here + rotate(turn, m.object_position - position),
+        object_velocity=rotate(turn, m.object_velocity - drift),
     )
 
 

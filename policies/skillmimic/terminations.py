@@ -8,7 +8,9 @@ import numpy as np
 
 from policies.skillmimic.rewards import Step
 
-BALL_LOST = 0.3  # m between ball and its reference, seen from the first key point, while the reference has it in hand
+# m between ball and its reference, seen from the first key point, while the reference has it in hand; of a ball that
+# bounces, at any time and over the floor
+BALL_LOST = 0.3
 FALLEN = 0.3  # m: the base; the retargeted pickup bends down to 0.48
 
 
@@ -20,7 +22,8 @@ def up(orientation_base_in_world: np.ndarray) -> np.ndarray:
 
 def _ball_lost(s: Step) -> np.ndarray:
     here, there = (m.object_position - m.points[:, 0] for m in (s.state, s.reference))
-    return (s.reference.contact[:, 0] > 0) & (np.linalg.norm(here - there, axis=1) > BALL_LOST)
+    away = (here - there) * np.where(s.bounces[:, None], [1.0, 1.0, 0.0], 1.0)
+    return (s.bounces | (s.reference.contact[:, 0] > 0)) & (np.linalg.norm(away, axis=1) > BALL_LOST)
 
 
 TERMINATIONS: dict[str, Callable[[Step], np.ndarray]] = {

@@ -1,27 +1,27 @@
 """A ball skill judged in the deployed loop: real codecs, emulated motors, the safety gate, and a camera or the truth.
 
-What counts is the same as in the training environment (``evaluate``): at every policy tick the body is compared with the
-clip that the skill imitates, from the moment in which the skill began there. The robot begins it from its soft start,
-or from the skill before, and not from the clip's first frame; so the clip is laid where the robot stands then, and turned
-to where it faces.
+What counts is the same as in the training environment (``evaluate``): its measures at every policy tick, of the robot and
+the clip that the skill imitates, from the moment in which the skill began; and success by the same rules. The robot begins
+from its soft start, or from the skill before, and not from the clip's first frame.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from drivers.sim.ball import MASS, RADIUS
 from policies.clips.kinematics import multiply, rotate
 from policies.clips.robot import POINT_NAMES
-from policies.skillmimic.evaluate import Measures, measure
+from policies.skillmimic.evaluate import Measures, Trace, measure, succeeded, ticks_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.randomisation import TABLE
 from policies.skillmimic.release import object_start
 from policies.skillmimic.rewards import Motion, Step
+from policies.skillmimic.stance import Place, arms, moved
 from policies.skillmimic.terminations import failed, up
 from policies.through_bytes import deployed, random_body
 from sim2real.contract import ObjectStart
@@ -30,53 +30,107 @@ from sim2real.object.scene import Handover
 from sim2real.simulation import Scene, Simulation
 
 BEFORE = 2.0  # s of the policy's first skill before another one begins
+AFTER = 0.1  # s that a run goes on after what is judged
+NONE = (0.0, 0.0, 0.0)
 
 
 class Judge:
-    """``each_tick`` of a Simulation: for ``seconds`` from ``begin`` s on, compares it with clip number ``clip`` of ``graph``."""
+    """``each_tick`` of a Simulation: from the moment in which the skill of clip number ``clip`` of ``graph`` begins there,
+    compares it with the clip for ``ticks`` of the policy."""
 
-    def __init__(self, graph: PolicyGraph, clip: int, begin: float, seconds: float) -> None:
-        self.graph, self.clip, self.begin, self.seconds = graph, clip, begin, seconds
-        self.sums, self.frames, self.failed = np.zeros(len(Measures._fields)), 0, False
-        self._touched: np.ndarray | None = None
-        self._turn, self._shift = np.zeros(4), np.zeros(3)
+    def __init__(self, graph: PolicyGraph, clip: int, ticks: int) -> None:
+        self.graph, self.clip, self.ticks = graph, clip, ticks
+        self.label = graph.labels[graph.clips.skill[clip]]
+        self.sums, self.failed = np.zeros(len(Measures._fields)), False
+        self._rows: list[tuple] = []  # of the Trace
+        self._touched = np.zeros(0, bool)
+        self._began: float | None = None
+        self._clock: float | None = None
+        self._laid: _Laid | None = None
         self._read: _Body | None = None
+
+    @property
+    def frames(self) -> int:
+        """How many ticks were compared."""
+        return len(self._rows)
+
+    @property
+    def success(self) -> float:
+        """In [0, 1], by the skill's rule; 0 if it never began."""
+        if not self._rows:
+            return 0.0
+        trace = Trace(*(np.array(column) for column in zip(*self._rows, strict=True)))
+        trace.up[-1] &= not self.failed  # a fault shows only when all is over
+        return succeeded(self.label, trace, self.graph.config.period, self.ticks)
 
     def __call__(self, simulation: Simulation) -> None:
         body = self._read = self._read or _Body(self.graph, simulation.world.plant)
-        since = simulation.since - self.begin
+        player, config, clips = simulation.player, self.graph.config, self.graph.clips
         touched = body.touching()
-        self._touched = touched if self._touched is None else self._touched | touched
-        decides = simulation.guardian.record["tick"][0] % simulation.every == 0
-        if not (decides and 0 <= since < self.seconds) or self.failed:
+        self._touched = touched if not self._touched.size else self._touched | touched
+        if self.failed or self.frames == self.ticks or simulation.guardian.record["tick"][0] % simulation.every:
             return
-        clips, config = self.graph.clips, self.graph.config
+        touched, self._touched = self._touched, np.zeros(0, bool)
+        before, self._clock = self._clock, self._now(player.policies[player.policy_index])
+        if self._began is None:
+            if simulation.since >= 0 and player.labels[player.skill] == self.label:
+                self._began = simulation.since
+            return  # whoever throws the ball does so now, and training too looks a tick later first
+        state, qvel = body.motion(touched), body.velocity()
+        since = simulation.since - self._began if before is None else before * config.period
         row = np.array([round(since / config.timestep)])
         reference = clips.motion(*clips.rows(np.array([self.clip]), row))
-        state = body.motion(self._touched)
-        if self.frames == 0:
-            self._lay(state, reference)
-        self._touched = None
-        height, tilt = state.points[:, 0, 2], up(state.orientation_base_in_world)
-        still, tilt_there = np.zeros((1, 1)), up(reference.orientation_base_in_world)
-        step = Step(self._laid(state), reference, still, still, height, tilt, tilt_there)
+        height, tilt, there = state.points[:, 0, 2], *(up(m.orientation_base_in_world) for m in (state, reference))
+        apart = np.linalg.norm(state.object_position - state.points[:, 0], axis=1)
+        state, reference = self._comparable(state, reference, qvel, body)
+        ends = not (clips.swing[self.clip] or clips.loop[self.clip])
+        if ends and row[0] >= clips.length[self.clip] and not reference.contact[0, 0]:  # it flies where it may
+            reference = reference._replace(object_position=state.object_position, object_velocity=state.object_velocity)
+        step = Step(state, reference, np.zeros((1, 1)), np.zeros((1, 1)), height, tilt, there, clips.loop[[self.clip]])
         self.failed = bool(failed(step, config.terminations)[0])
         self.sums += np.array(measure(step))[:, 0]
-        self.frames += 1
+        self._rows.append((touched[0], state.object_velocity[0], apart[0], height[0], not self.failed))
 
-    def _lay(self, state: Motion, reference: Motion) -> None:
-        """From the robot's place and heading to the clip's."""
+    def _now(self, policy: Any) -> float | None:
+        """How far the plan is, in ticks, of a skill whose plan waits for its ball."""
+        return (
+            float(policy.carries["carry_clock"][0])
+            if self.graph.plan is not None and self.label in self.graph.config.timed
+            else None
+        )
+
+    def _comparable(self, state: Motion, reference: Motion, qvel: np.ndarray, body: _Body) -> tuple[Motion, Motion]:
+        """Both where training compares them: seen from the trunk if the legs are a base policy's, else laid on the clip."""
+        clips, graph = self.graph.clips, self.graph
+        if graph.base is not None:
+            stance = clips.skill[[self.clip]]
+            there = clips.trunk_position[stance], clips.trunk_orientation[stance]
+            state = arms(moved(state, qvel, body.trunk(), there), graph.acting)
+            reference = arms(reference, graph.acting)
+        else:
+            self._laid = self._laid or _Laid.at(state, reference)
+            state = self._laid(state)
+        return state, reference
+
+
+class _Laid(NamedTuple):
+    """From a robot's place and heading to the clip's."""
+
+    turn: np.ndarray  # (4,)
+    shift: np.ndarray  # (3,) m
+
+    @classmethod
+    def at(cls, state: Motion, reference: Motion) -> _Laid:
         yaw = _yaw(reference.orientation_base_in_world[0]) - _yaw(state.orientation_base_in_world[0])
-        self._turn = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
-        here = rotate(self._turn, state.points[0, 0])
-        self._shift = (reference.points[0, 0] - here) * [1.0, 1.0, 0.0]
+        turn = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
+        return cls(turn, (reference.points[0, 0] - rotate(turn, state.points[0, 0])) * [1.0, 1.0, 0.0])
 
-    def _laid(self, m: Motion) -> Motion:
+    def __call__(self, m: Motion) -> Motion:
         return m._replace(
-            points=rotate(self._turn, m.points) + self._shift,
-            orientation_base_in_world=multiply(self._turn, m.orientation_base_in_world),
-            object_position=rotate(self._turn, m.object_position) + self._shift,
-            object_velocity=rotate(self._turn, m.object_velocity),
+            points=rotate(self.turn, m.points) + self.shift,
+            orientation_base_in_world=multiply(self.turn, m.orientation_base_in_world),
+            object_position=rotate(self.turn, m.object_position) + self.shift,
+            object_velocity=rotate(self.turn, m.object_velocity),
         )
 
 
@@ -89,7 +143,8 @@ class _Body:
         named = graph.body.model
         self._anchors = {n: model.joint(named.joint(i).name).id for n, i in place.items()}
         self._sites = {n: model.site(n).id for n in POINT_NAMES if n not in place}
-        self._base = model.body(graph.robot.base).id
+        self._base, self._trunk = model.body(graph.robot.base).id, model.body(graph.body.trunk).id
+        self._free = int(model.jnt_dofadr[model.body_jntadr[self._base]])
         self._order = [plant.joints.index(name) for name in graph.joint_names]
         contacts = graph.contact_graph
         node = {geom: k for k, geoms in enumerate(contacts.nodes.values()) for geom in geoms}
@@ -109,6 +164,14 @@ class _Body:
                 found[self._edges.index(edge)] = True
         return found
 
+    def velocity(self) -> np.ndarray:
+        """(1, 6) of the base: m/s in the world, rad/s in the base."""
+        return self._plant.data.qvel[None, self._free : self._free + 6].copy()
+
+    def trunk(self) -> Place:
+        """Where the trunk is."""
+        return self._plant.data.xpos[None, self._trunk].copy(), self._plant.data.xquat[None, self._trunk].copy()
+
     def motion(self, touched: np.ndarray) -> Motion:
         plant, data = self._plant, self._plant.data
         place = {n: data.xanchor[i] for n, i in self._anchors.items()}
@@ -127,27 +190,46 @@ class _Body:
 
 
 def deploy_episode(
-    path: Path, graph: PolicyGraph, clip: int, seconds: float, camera: CameraModel | None, seed: int
+    path: Path,
+    graph: PolicyGraph,
+    clip: int,
+    seconds: float,
+    camera: CameraModel | None,
+    seed: int,
+    watch: Callable[[Simulation], None] = lambda simulation: None,
 ) -> Judge:
     """One lockstep run of the skill of clip number ``clip``, on a randomised body with a randomised ball.
 
-    ``seconds``: its length, at most the clip's where it does not swing. ``camera`` None: the policy is fed the truth about
-    its ball. A fault of the safety gate fails the episode.
+    ``seconds``: its length, as in ``ticks_of``. A skill that walks is told a velocity as in training. ``camera`` None: the
+    policy is fed the truth about its ball. A fault of the safety gate, and a run that ends before its time, fail. ``watch`` is
+    called after every tick of the guardian.
     """
     rng = np.random.default_rng([seed, clip])
-    clips, config = graph.clips, graph.config
-    label, first = graph.labels[clips.skill[clip]], graph.labels[0]
-    if not clips.swing[clip]:
-        seconds = min(seconds, (clips.length[clip] - 1) * config.timestep)
-    before = [] if label == first else [(first, BEFORE)]
-    judge = Judge(graph, clip, BEFORE if before else 0.0, seconds)
+    config, ticks = graph.config, ticks_of(graph, clip, seconds)
+    label, first = graph.labels[graph.clips.skill[clip]], graph.labels[0]
+    steps = [] if label == first else [(first, BEFORE)]
+    steps.append((label, ticks * config.period + AFTER))
+    judge = Judge(graph, clip, ticks)
+
+    def each_tick(simulation: Simulation) -> None:
+        judge(simulation)
+        watch(simulation)
+
     scene = Scene(seed=seed, prepare=random_body(rng), camera=camera, ball=random_ball(rng))
-    simulation = deployed(path, [*before, (label, seconds)], scene, each_tick=judge)
+    simulation = deployed(path, steps, scene, [NONE] * (len(steps) - 1) + [command(graph, label, rng)], each_tick)
     starts = {n: ObjectStart.model_validate(object_start(graph, clip if n == label else 0)) for n in {first, label}}
     simulation.handover = Handover(simulation.world, starts)
     summary = simulation.run()
-    judge.failed |= bool(summary.faults) or judge.frames < round((seconds - 0.1) / config.period)
+    judge.failed |= bool(summary.faults) or judge.frames < ticks
     return judge
+
+
+def command(graph: PolicyGraph, label: str, rng: np.random.Generator) -> tuple[float, float, float]:
+    """A velocity command (m/s, m/s, rad/s) for an episode of a skill, drawn as training draws them."""
+    if graph.base is None or label not in graph.config.walks or rng.random() < graph.config.still:
+        return NONE
+    forward, left, turn = rng.uniform(graph.base.config.command_low, graph.base.config.command_high)
+    return float(forward), float(left), float(turn)
 
 
 def random_ball(rng: np.random.Generator) -> dict[str, float]:

@@ -20,6 +20,7 @@ from sim2real.tracker import ObjectEstimate, ObjectTracker, rotate
 AWAY = 0.4  # m in front of its place: where a ball waits that will be put into the robot's hands
 COMING, BROUGHT = 0.6, 1.4  # s that bringing it takes, s before the end of the soft start at which it is there
 HANDING_OVER = 0.3  # s for which a ball in the robot's hands is held on to
+CLOSING = 0.8  # s for which it is where the hands come from elsewhere, of a robot that may have walked
 REACH = 0.4  # m: a ball farther from its place is not in the robot's hands any more
 
 
@@ -58,7 +59,7 @@ class Handover:
             self._world.throw_ball(place, velocity)
         elif first or np.linalg.norm(place - truth.position_object_in_world) > REACH:
             self._world.carry_ball(place)
-            self._let_go = since + HANDING_OVER
+            self._let_go = since + (HANDING_OVER if first else CLOSING)
 
 
 def in_world(start: ObjectStart, truth: Truth, ahead: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

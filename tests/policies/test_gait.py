@@ -99,11 +99,18 @@ def test_the_swinging_foot_is_lifted_and_the_other_is_not():
     assert abs(foot("right", offsets(0.25))[2] - foot("right", rest)[2]) < 0.01
 
 
-def test_a_standing_foot_goes_back_as_fast_as_the_robot_goes_forward():
-    """Over the middle half of the stance; a harmonic is faster there than on average by pi / 2 and slower at its ends."""
-    on_time = STILL._replace(forward_speed=torch.tensor([[0.5]]))
-    a, b = (foot("right", offsets(phase, FORWARD, on_time)) for phase in (0.01, 0.49))
-    assert (a - b)[0] / (0.48 * STRIDE.period) == pytest.approx(0.5, rel=0.1)
+def test_a_standing_foot_goes_back_as_fast_as_the_robot_goes_aside_and_forwards_not_at_all():
+    """From one end of the stance to the other."""
+    left = torch.tensor([[0.0, 0.3, 0.0]])
+    for command, speed, swept in (
+        (FORWARD, {"forward_speed": 0.5}, [0.0, 0.0]),
+        (left, {"left_speed": 0.3}, [0.0, 0.3]),
+    ):
+        on_time = STILL._replace(**{k: torch.tensor([[v]]) for k, v in speed.items()})
+        rest = (foot("right", offsets(phase, NONE)) for phase in (0.01, 0.49))
+        moved = (foot("right", offsets(phase, command, on_time)) for phase in (0.01, 0.49))
+        (a, b), (c, d) = rest, moved
+        assert ((c - d) - (a - b))[:2] / (0.48 * STRIDE.period) == pytest.approx(swept, abs=0.03)
 
 
 def test_a_robot_faster_than_told_puts_its_foot_further():

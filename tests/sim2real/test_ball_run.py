@@ -15,7 +15,7 @@ from sim2real.config import load_robot
 from sim2real.contract import Object, ObjectStart
 from sim2real.launch import Launch
 from sim2real.object.camera import CameraModel
-from sim2real.object.scene import AWAY, HANDING_OVER, Handover, prepare_for
+from sim2real.object.scene import AWAY, CLOSING, HANDING_OVER, Handover, prepare_for
 from sim2real.operators.script import ScriptOperator, Step
 from sim2real.policy import load_policy
 from sim2real.recorder.plot import page
@@ -170,6 +170,10 @@ def test_a_ball_that_is_in_its_hands_is_left_alone(world):
     world.throw_ball((3.0, 0.0, 1.0), (0.0, 0.0, 0.0))
     handover.act(Stage.RUN, "hold", -1.0, 1.2)
     assert world.plant.ball.carried and np.linalg.norm(place(world)[:2]) < 1.0
+    handover.act(Stage.RUN, "hold", -1.0, 1.2 + HANDING_OVER + 0.1)
+    assert world.plant.ball.carried  # the hands come from elsewhere
+    handover.act(Stage.RUN, "hold", -1.0, 1.2 + CLOSING + 0.1)
+    assert not world.plant.ball.carried
 
 
 def test_a_world_without_a_ball_says_so(g1):

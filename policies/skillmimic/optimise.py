@@ -1,0 +1,148 @@
+"""Trajectory optimisation of the arms' plan (Liu & Hodgins 2018, section 4.1): CMA-ES over offsets and feedback.
+
+A candidate is judged by the training's own reward, over several randomised robots and balls, with no network in the loop.
+``python -m policies.skillmimic.optimise g1-ball catch`` continues from what the task's corrections hold.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+
+import cma
+import numpy as np
+import torch
+import yaml
+from torch import Tensor
+
+from policies.mirror import joint_mirror
+from policies.skillmimic import plan
+from policies.skillmimic.config import TASKS, SkillMimic
+from policies.skillmimic.env import Env
+from policies.skillmimic.evaluate import ticks_of
+from policies.skillmimic.graph import ROOT, PolicyGraph
+from policies.skillmimic.plan import KNOTS, Correction
+
+OFFSET, GAIN, DAMP = 0.1, 0.4, 0.04  # rad, m/m and m/(m/s): what is one unit of the search
+SECONDS = 4.0  # of an episode that does not end by itself
+
+
+class Search:
+    """The corrections of one skill as a vector, about 1 in size.
+
+    Where both palms work, both arms do the same, mirrored; where one does, the other arm is left alone.
+    """
+
+    def __init__(self, graph: PolicyGraph, skill: int) -> None:
+        self.graph, self.skill = graph, skill
+        clip = int(np.flatnonzero(graph.clips.skill == skill)[0])
+        still = bool(graph.clips.swing[clip])
+        self.count = 1 if still else KNOTS
+        names = [graph.joint_names[j] for j in graph.acting]
+        self.order, sign = joint_mirror(names)
+        self.sign = np.array(sign)
+        both = bool(graph.clips.hands[clip].all())
+        side = "left" if both or graph.clips.hands[clip, 0] else "right"
+        self.free = np.array([name.startswith(side) for name in names])
+        self.both = both
+
+    def offsets(self, x: np.ndarray) -> np.ndarray:
+        """(..., KNOTS, arms) rad of vectors (..., size)."""
+        arms = len(self.free)
+        own = np.zeros((*x.shape[:-1], self.count, arms))
+        own[..., self.free] = x[..., :-6].reshape(*x.shape[:-1], self.count, -1) * OFFSET
+        if self.both:
+            own = own + own[..., self.order] * self.sign
+        return np.broadcast_to(own, (*x.shape[:-1], KNOTS, arms))
+
+    def gains(self, x: np.ndarray) -> np.ndarray:
+        """(..., 6) of vectors (..., size)."""
+        return x[..., -6:] * ([GAIN] * 3 + [DAMP] * 3)
+
+    def correction(self, x: np.ndarray) -> Correction:
+        return Correction(self.offsets(x)[: self.count], *np.split(self.gains(x), 2))
+
+    def vector(self, c: Correction) -> np.ndarray:
+        """Of what a file holds."""
+        own = c.offsets[: self.count][:, self.free] / OFFSET
+        return np.concatenate([own.ravel(), c.follow / GAIN, c.damp / DAMP])
+
+
+def score(env: Env, candidates: np.ndarray, search: Search, ticks: int) -> np.ndarray:
+    """(candidates,): mean reward of a tick, 0 after a failure, plus half the share of ticks before one.
+
+    ``env`` has as many robots for each candidate as for another, in turn.
+    """
+    each = env.num_envs // len(candidates)
+    of = np.tile(np.arange(len(candidates)), each)
+    offsets = torch.from_numpy(search.offsets(candidates)[of].astype(np.float32))
+    gains = torch.from_numpy(search.gains(candidates)[of].astype(np.float32))
+    assert env.graph.plan is not None
+    env.graph.plan.corrections = lambda skill: (offsets, gains)  # type: ignore[method-assign]
+    env.reset()
+    env.episode_length_buf[:] = 0
+    idle: Tensor = torch.zeros(env.num_envs, env.num_actions)
+    alive, total = np.full(env.num_envs, True), np.zeros(env.num_envs)
+    with torch.no_grad():
+        for _ in range(ticks):
+            _, rewards, _, _ = env.step(idle)
+            alive &= ~env.failures
+            total += alive * (rewards.numpy() + 0.5)
+    return (total / ticks).reshape(each, len(candidates)).mean(axis=0)
+
+
+def optimise(config: SkillMimic, skill: str, generations: int, candidates: int, each: int, seed: int = 0) -> Correction:
+    """The best mean of the search's distribution, after ``generations``. Prints a line for each."""
+    config = dataclasses.replace(config, skills=(skill,), envs=candidates * each, anywhere=False, push_chance=0.0)
+    graph = PolicyGraph(config)
+    clip = 0
+    ticks = ticks_of(graph, clip, SECONDS)
+    env = Env(dataclasses.replace(config, frames=ticks), seed, graph)
+    search = Search(graph, 0)
+    start = search.vector(plan.read(ROOT / (config.corrections or "none"), [skill], len(graph.acting))[0])
+    es = cma.CMAEvolutionStrategy(
+        start, 0.3, {"popsize": candidates - 1, "seed": seed + 1, "verbose": -9, "CMA_diagonal": 15}
+    )
+    for generation in range(generations):
+        asked = es.ask()
+        values = score(env, np.array([*asked, es.mean]), search, ticks)
+        es.tell(asked, (-values[:-1]).tolist())
+        print(
+            f"{skill}: {generation + 1}/{generations}, mean {values[-1]:.3f}, best {values.max():.3f}, sigma {es.sigma:.3f}",
+            flush=True,
+        )
+    return search.correction(es.mean)
+
+
+def write(path: Path, skill: str, c: Correction) -> None:
+    """Put a skill's correction into a file, beside the others'."""
+    document = yaml.safe_load(path.read_text()) if path.is_file() else {}
+    document[skill] = {
+        "offsets": [[round(float(x), 4) for x in row] for row in c.offsets],
+        "follow": [round(float(x), 4) for x in c.follow],
+        "damp": [round(float(x), 4) for x in c.damp],
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(yaml.safe_dump(document, default_flow_style=None, width=120, sort_keys=True))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="find the corrections of a skill's plan")
+    parser.add_argument("task", choices=[name for name, c in TASKS.items() if c.base])
+    parser.add_argument("skill")
+    parser.add_argument("--generations", type=int, default=40)
+    parser.add_argument("--candidates", type=int, default=24)
+    parser.add_argument("--each", type=int, default=16, help="randomised robots a candidate is judged by")
+    arguments = parser.parse_args()
+    config = TASKS[arguments.task]
+    if arguments.skill not in config.skills or config.corrections is None:
+        sys.exit(f"skill: got '{arguments.skill}', expected one of {', '.join(config.skills)}")
+    torch.set_num_threads(1)
+    found = optimise(config, arguments.skill, arguments.generations, arguments.candidates, arguments.each)
+    write(ROOT / config.corrections, arguments.skill, found)
+
+
+if __name__ == "__main__":
+    main()

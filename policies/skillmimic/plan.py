@@ -1,0 +1,155 @@
+"""What the arms do by plan, before any network: a skill's clip as targets, put right by optimisation and by feedback.
+
+Liu & Hodgins (2018, section 4) track a clip with open-loop offsets found by trajectory optimisation and a linear feedback
+from the ball, and learn on top. So here: ``optimise.py`` finds offsets at knots along the clip, and how far the palms
+follow a ball that is not where the clip has it. The plan's clock runs with the ball where the ball sets the time (it is
+caught, it bounces), and by itself elsewhere. Actions are a residual on all of this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import yaml
+from torch import Tensor, nn
+
+from sim2real.types import Sim2realError
+
+KNOTS = 8  # of a skill that moves
+REACH = 0.12  # m, the furthest that palms follow the ball
+SLOW = 0.5  # m/s: a ball slower than this says little about the time
+
+
+class Correction(NamedTuple):
+    """What was optimised, of one skill."""
+
+    offsets: np.ndarray  # (KNOTS, arms) rad, added to targets; all alike for a skill that holds still
+    follow: np.ndarray  # (3,) m of the palms per m of the ball: forwards, left, up
+    damp: np.ndarray  # (3,) m per m/s
+
+
+@dataclass
+class Rows:
+    """One skill's targets, a row a policy period."""
+
+    target: np.ndarray  # (T, arms) rad
+    ball: np.ndarray  # (T, 3) m in the base
+    velocity: np.ndarray  # (T, 3) m/s
+    back: np.ndarray  # (T, arms, 3) rad of the arms whose palms have business with the ball, per m that they move
+    loop: bool
+    pull: np.ndarray  # (T,) rows a tick per s that the ball is ahead, of a clock that follows it; 0: it runs by itself
+    knots: np.ndarray = field(init=False)  # (T, KNOTS) shares of the knots in each row
+
+    def __post_init__(self) -> None:
+        count = len(self.target)
+        at = np.arange(count) / max(count, 1) * KNOTS if self.loop else np.linspace(0, KNOTS - 1, count)
+        gap = np.abs(at[:, None] - np.arange(KNOTS))
+        if self.loop:
+            gap = np.minimum(gap, KNOTS - gap)
+        self.knots = np.maximum(1 - gap, 0.0)
+
+
+class Planned(NamedTuple):
+    """This tick of every robot."""
+
+    target: Tensor  # (N, arms) rad
+    clock: Tensor  # (N, 1) rows since the skill's beginning
+    ball_error: Tensor  # (N, 6) m and m/s from where the plan has the ball
+
+
+class Plan(nn.Module):
+    """Every skill's rows end to end; part of the exported graph."""
+
+    table: Tensor
+    knots: Tensor
+    back: Tensor
+    following: Tensor
+    first: Tensor
+    last: Tensor
+    loop: Tensor
+    offsets: Tensor
+    follow: Tensor
+
+    def __init__(self, rows: Sequence[Rows], corrections: Sequence[Correction]) -> None:
+        super().__init__()
+        self.arms = rows[0].target.shape[1]
+        lengths = np.array([len(r.target) for r in rows])
+        self.longest = float(max(lengths))
+        first = np.cumsum([0, *lengths[:-1]])
+        following = np.arange(lengths.sum()) + 1
+        for begin, count, r in zip(first, lengths, rows, strict=True):
+            following[begin + count - 1] = begin if r.loop else begin + count - 1
+        tables = [np.concatenate([r.target, r.ball, r.velocity, r.pull[:, None]], axis=1) for r in rows]
+        self.register_buffer("table", _buffer(np.concatenate(tables)))
+        self.register_buffer("knots", _buffer(np.concatenate([r.knots for r in rows])))
+        self.register_buffer("back", _buffer(np.concatenate([r.back for r in rows])))
+        self.register_buffer("following", torch.tensor(following))
+        self.register_buffer("first", _buffer(first[:, None]))
+        self.register_buffer("last", _buffer(lengths[:, None] - 1))
+        self.register_buffer("loop", _buffer([[r.loop] for r in rows]))
+        self.register_buffer("offsets", _buffer(np.stack([c.offsets for c in corrections])))
+        self.register_buffer("follow", _buffer(np.stack([np.concatenate([c.follow, c.damp]) for c in corrections])))
+
+    def corrections(self, skill: Tensor) -> tuple[Tensor, Tensor]:
+        """Offsets (N, KNOTS, arms) and gains (N, 6) of each robot's skill (N, labels)."""
+        return torch.einsum("ns,ska->nka", skill, self.offsets), skill @ self.follow
+
+    def forward(self, skill: Tensor, last_skill: Tensor, last_clock: Tensor, ball: Tensor) -> Planned:
+        """``skill`` (N, labels) one-hot, and that of the tick before with its clock (N, 1); ``ball`` (N, 6) m and m/s in
+        the base."""
+        same = (skill * last_skill).sum(dim=-1, keepdim=True)
+        last, loop = skill @ self.last, skill @ self.loop
+        clock = self._step(skill, same * last_clock, same, last, loop, ball)
+        here = torch.floor(clock)
+        share = clock - here
+        row = (skill @ self.first + here)[:, 0].to(torch.int64)
+        following = self.following[row]
+        mixed = lambda t: t[row] + share * (t[following] - t[row])  # noqa: E731
+        planned = mixed(self.table)
+        error = ball - planned[:, self.arms : self.arms + 6]
+        offsets, gains = self.corrections(skill)
+        moved = error * gains
+        palm = torch.clamp(moved[:, :3] + moved[:, 3:], -REACH, REACH)
+        target = planned[:, : self.arms] + (mixed(self.knots)[:, :, None] * offsets).sum(dim=1)
+        target = target + (self.back[row] * palm[:, None]).sum(dim=-1)
+        return Planned(target, clock, error)
+
+    def _step(self, skill: Tensor, clock: Tensor, same: Tensor, last: Tensor, loop: Tensor, ball: Tensor) -> Tensor:
+        """The clock, moved on: a row a tick, and faster or slower as the ball is ahead of its plan or behind."""
+        row = (skill @ self.first + torch.floor(clock))[:, 0].to(torch.int64)
+        planned = self.table[row][:, self.arms :]
+        velocity = planned[:, 3:6]
+        ahead = ((ball[:, :3] - planned[:, :3]) * velocity).sum(-1, keepdim=True)
+        ahead = ahead / ((velocity * velocity).sum(-1, keepdim=True) + SLOW**2)  # s
+        rate = torch.clamp(same + planned[:, 6:] * ahead, 0.0, 2.0)
+        moved = clock + rate
+        around = moved - (last + 1) * torch.floor(moved / (last + 1))
+        return torch.where(loop > 0, around, torch.minimum(moved, last))
+
+
+def read(path: Path, skills: Sequence[str], arms: int) -> list[Correction]:
+    """Of every skill, the corrections in a file that ``optimise.py`` wrote; none where the file says nothing of it.
+
+    Raises Sim2realError.
+    """
+    document: Mapping = yaml.safe_load(path.read_text()) if path.is_file() else {}
+    found = []
+    for skill in skills:
+        entry = document.get(skill, {"offsets": [[0.0] * arms], "follow": [0.0] * 3, "damp": [0.0] * 3})
+        offsets, follow, damp = (np.array(entry[k], float) for k in ("offsets", "follow", "damp"))
+        if offsets.shape not in ((1, arms), (KNOTS, arms)) or follow.shape != (3,) or damp.shape != (3,):
+            raise Sim2realError(
+                f"{path}: '{skill}': got offsets {offsets.shape}, follow {follow.shape}, damp {damp.shape}, expected"
+                f" (1 or {KNOTS}, {arms}), (3,), (3,): optimise it again (policies/skillmimic/optimise.py)"
+            )
+        found.append(Correction(np.broadcast_to(offsets, (KNOTS, arms)), follow, damp))
+    return found
+
+
+def _buffer(values: np.ndarray | list) -> Tensor:
+    return torch.tensor(np.asarray(values), dtype=torch.float32)

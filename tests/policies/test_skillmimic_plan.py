@@ -1,0 +1,136 @@
+"""The plan of the arms: its clock, its corrections, its feedback, and the search that finds them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from policies.skillmimic.config import TASKS
+from policies.skillmimic.env import Env
+from policies.skillmimic.graph import PULL, PolicyGraph
+from policies.skillmimic.optimise import Search, score, write
+from policies.skillmimic.plan import KNOTS, REACH, Correction, Plan, Rows, read
+from sim2real.types import Sim2realError
+
+ARMS, T = 2, 8
+THREE = [0.0, 0.0, 0.0]
+
+
+def rows(loop: bool = False, pull: float = 0.0) -> Rows:
+    """A ball that flies forwards at 1 m/s, 2 cm a row, and one joint that follows the row's number."""
+    t = np.arange(T)
+    ball = np.column_stack([t * 0.02, np.zeros(T), np.zeros(T)])
+    back = np.zeros((T, ARMS, 3))
+    back[:, 1, 2] = 2.0  # a metre up is two radians of the second joint
+    return Rows(
+        np.column_stack([t * 0.1, np.zeros(T)]), ball, np.tile([1.0, 0, 0], (T, 1)), back, loop, np.full(T, pull)
+    )
+
+
+def correction(offset: float = 0.0, follow: list[float] = THREE, damp: list[float] = THREE) -> Correction:
+    return Correction(np.tile([offset, 0.0], (KNOTS, 1)), np.array(follow), np.array(damp))
+
+
+def at(plan: Plan, clock: float, ball: list[float], skill: int = 0, before: int = 0):
+    one = torch.eye(len(plan.first))
+    return plan(one[[skill]], one[[before]], torch.tensor([[clock]]), torch.tensor([ball], dtype=torch.float32))
+
+
+def where(row: float) -> list[float]:
+    """The ball that the plan has there."""
+    return [row * 0.02, 0.0, 0.0, 1.0, 0.0, 0.0]
+
+
+def test_a_clock_runs_a_row_a_tick_and_stays_at_the_end():
+    plan = Plan([rows()], [correction()])
+    p = at(plan, 3.0, where(4))
+    assert float(p.clock) == 4.0
+    np.testing.assert_allclose(p.target, [[0.4, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(p.ball_error, np.zeros((1, 6)), atol=1e-6)
+    assert float(at(plan, T - 1.0, where(7)).clock) == T - 1
+
+
+def test_a_loop_begins_again():
+    plan = Plan([rows(loop=True)], [correction()])
+    assert float(at(plan, T - 1.0, where(0)).clock) == 0.0
+
+
+def test_a_skill_begins_at_its_first_row():
+    plan = Plan([rows(), rows()], [correction()] * 2)
+    assert float(at(plan, 5.0, where(0), skill=1, before=0).clock) == 0.0
+    assert float(at(plan, 5.0, where(6), skill=1, before=1).clock) == 6.0
+
+
+@pytest.mark.parametrize(("ball", "rate"), [(where(3), 1.0), (where(1), None), ([-5.0, 0, 0, 1, 0, 0], 0.0),
+                                            ([5.0, 0, 0, 1, 0, 0], 2.0)])  # fmt: skip
+def test_a_clock_that_follows_the_ball_waits_for_it_and_hurries_after_it(ball, rate):
+    """At row 3, 1 m/s: a ball two rows behind slows the clock by PULL x 0.04 m x v / (v^2 + 0.5^2)."""
+    got = float(at(Plan([rows(pull=PULL)], [correction()]), 3.0, ball).clock) - 3.0
+    assert got == pytest.approx(1 - PULL * 0.04 / 1.25 if rate is None else rate, abs=1e-5)
+
+
+def test_offsets_are_spread_over_the_rows_by_their_knots():
+    plain = rows()
+    np.testing.assert_allclose(plain.knots.sum(axis=1), np.ones(T))
+    assert plain.knots[0, 0] == plain.knots[-1, -1] == 1.0
+    around = rows(loop=True).knots
+    np.testing.assert_allclose(around.sum(axis=1), np.ones(T))
+    late = at(Plan([rows()], [correction(offset=0.3)]), 3.0, where(4))
+    np.testing.assert_allclose(late.target, [[0.7, 0.0]], atol=1e-6)
+
+
+def test_palms_follow_a_ball_that_is_elsewhere_as_far_as_they_reach():
+    plan = Plan([rows()], [correction(follow=[0.0, 0.0, 0.5], damp=[0.0, 0.0, 0.1])])
+    off = [0.08, 0.0, 0.04, 1.0, 0.0, 0.2]  # 4 cm up, and on its way at 0.2 m/s
+    np.testing.assert_allclose(at(plan, 3.0, off).target, [[0.4, 2.0 * (0.5 * 0.04 + 0.1 * 0.2)]], atol=1e-6)
+    np.testing.assert_allclose(at(plan, 3.0, [0, 0, 9, 1, 0, 0]).target, [[0.4, 2.0 * REACH]], atol=1e-6)
+
+
+def test_what_was_found_is_read_back(tmp_path):
+    path = tmp_path / "plan.yaml"
+    some = Correction(np.round(np.random.default_rng(0).normal(size=(KNOTS, ARMS)), 4), np.ones(3), np.zeros(3))
+    write(path, "catch", some)
+    write(path, "pass", correction())
+    (there, none) = read(path, ["catch", "hold"], ARMS)
+    for a, b in zip(there, some, strict=True):
+        np.testing.assert_allclose(a, b)
+    assert not none.offsets.any() and not none.follow.any()
+    document = yaml.safe_load(path.read_text())
+    document["catch"]["offsets"] = [[0.0]]
+    path.write_text(yaml.safe_dump(document))
+    with pytest.raises(Sim2realError, match=r"'catch': got offsets \(1, 1\).*expected"):
+        read(path, ["catch"], ARMS)
+
+
+@pytest.fixture(scope="module")
+def graph():
+    config = dataclasses.replace(TASKS["g1-ball"], envs=8, threads=1, anywhere=False, push_chance=0.0)
+    return PolicyGraph(config)
+
+
+def test_both_arms_are_corrected_alike_but_for_a_dribble(graph):
+    names = [graph.joint_names[j] for j in graph.acting]
+    for label in graph.labels:
+        search = Search(graph, graph.labels.index(label))
+        size = search.count * int(search.free.sum()) + 6
+        c = search.correction(np.arange(1.0, size + 1))
+        moved = {names[k].partition("_")[0] for k in np.flatnonzero(np.abs(c.offsets).max(axis=0))}
+        assert moved == ({"right"} if label == "dribble_in_place" else {"left", "right"})
+        assert search.count == (1 if label in graph.config.swing else KNOTS)
+        np.testing.assert_allclose(search.vector(c), np.arange(1.0, size + 1), atol=1e-9)
+
+
+def test_a_candidate_that_drops_the_ball_scores_less(graph):
+    config = dataclasses.replace(graph.config, skills=("hold",), clips=("hold_01",), frames=40)
+    one = PolicyGraph(config)
+    search = Search(one, 0)
+    still = search.vector(Correction(one.plan.offsets[0].numpy(), *np.split(one.plan.follow[0].numpy(), 2)))
+    apart = still.copy()
+    apart[:-6] += np.where([n.endswith("shoulder_roll_joint") for n in one.joint_names if n.startswith("left_")
+                            and any(p in n for p in ("shoulder", "elbow", "wrist"))], 6.0, 0.0)  # fmt: skip
+    values = score(Env(config, 0, one), np.stack([still, apart]), search, 40)
+    assert values[0] > 1.2 and values[1] < 0.6

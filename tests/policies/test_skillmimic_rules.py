@@ -1,0 +1,71 @@
+"""What counts as a success, and that an episode's end, and not what would have come after it, is looked at."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from policies.skillmimic.evaluate import LEAST, Trace, succeeded
+
+PERIOD, TICKS = 0.02, 100
+
+
+def trace(held, velocity=(0.0, 0.0, 0.0), up=True, apart=0.4, height=0.7) -> Trace:
+    held = np.asarray(held, bool)
+    up = np.broadcast_to(up, held.shape).copy()
+    rows = [np.full(len(held), x) for x in (apart, height)]
+    return Trace(held, np.tile(velocity, (len(held), 1)), *rows, up)
+
+
+def holds(first: int, then: int) -> np.ndarray:
+    return np.r_[np.ones(first, bool), np.zeros(then, bool)]
+
+
+def success(skill: str, t: Trace) -> float:
+    return succeeded(skill, t, PERIOD, TICKS)
+
+
+def test_a_kept_ball_is_one_whose_episode_never_failed():
+    assert success("hold", trace(holds(TICKS, 0))) == 1
+    assert success("hold", trace(holds(30, 0), up=np.arange(30) < 29)) == 0
+
+
+@pytest.mark.parametrize(
+    ("velocity", "good"),
+    [((2.0, 0.0, 0.0), 1), ((2.0, 0.7, 0.0), 1), ((2.0, 0.8, 0.0), 0), ((-2.0, 0.0, 0.0), 0), ((LEAST - 0.1, 0, 0), 0)],
+)
+def test_a_thrown_ball_flies_forwards(velocity, good):
+    assert success("pass", trace(holds(40, 60), velocity)) == good
+
+
+def test_a_throw_lets_go_and_the_robot_stands():
+    fast = (3.0, 0.0, 0.0)
+    assert success("pass", trace(holds(TICKS, 0), fast)) == 0
+    assert success("pass", trace(holds(40, 60), fast, up=np.arange(100) < 99)) == 0
+    again = holds(40, 60)
+    again[80:] = True  # it took the ball back
+    assert success("shot", trace(again, fast)) == 0
+
+
+def test_a_catch_holds_until_the_end():
+    caught = ~holds(60, 40)
+    assert success("catch", trace(caught)) == 1
+    short = ~holds(80, 20)  # 0.4 s
+    assert success("catch", trace(short)) == 0
+    dropped = caught.copy()
+    dropped[90] = False
+    assert success("catch", trace(dropped)) == 0
+    assert success("catch", trace(caught, up=np.arange(100) < 99)) == 0
+
+
+def test_dribbling_counts_frames_of_all_that_were_due():
+    touches = np.arange(TICKS) % 25 == 0
+    assert success("dribble_in_place", trace(touches)) == 1
+    assert success("dribble_in_place", trace(touches[:50], up=np.arange(50) < 49)) == pytest.approx(0.49)
+    assert success("dribble_in_place", trace(touches, apart=1.2)) == 0  # 1.5 m of a person
+    assert success("dribble_in_place", trace(touches, height=0.35)) == 0
+
+
+def test_a_ball_nobody_touches_any_more_is_not_dribbled():
+    once = np.arange(200) == 0
+    assert succeeded("dribble_in_place", trace(once), PERIOD, 200) == pytest.approx(0.5)
