@@ -111,7 +111,8 @@ class PolicyGraph(nn.Module):
     def carry_start(self) -> dict[str, list[float]]:
         """What each carried tensor is before the first tick; an empty list is zeros."""
         names = [n for n in self.inputs() if n.startswith("carry_")]
-        return {n: self.clips.stances[0].tolist() if n == "carry_base_posture" else [] for n in names}
+        start = torch.where(self.acts > 0, self.postures[0], _buffer(self.clips.stances[0])).tolist()
+        return {n: start if n == "carry_base_posture" else [] for n in names}
 
     def inputs(self) -> dict[str, list[int]]:
         """Every input by name with its shape, without the batch axis, in the order of ``forward``."""

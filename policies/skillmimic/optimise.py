@@ -9,9 +9,11 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
+import time
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 
-import cma
 import numpy as np
 import torch
 import yaml
@@ -24,6 +26,10 @@ from policies.skillmimic.env import Env
 from policies.skillmimic.evaluate import ticks_of
 from policies.skillmimic.graph import ROOT, PolicyGraph
 from policies.skillmimic.plan import KNOTS, Correction
+
+with warnings.catch_warnings():  # that there is no matplotlib
+    warnings.simplefilter("ignore", UserWarning)
+    import cma
 
 OFFSET, GAIN, DAMP = 0.1, 0.4, 0.04  # rad, m/m and m/(m/s): what is one unit of the search
 SECONDS = 4.0  # of an episode that does not end by itself
@@ -93,27 +99,39 @@ def score(env: Env, candidates: np.ndarray, search: Search, ticks: int) -> np.nd
     return (total / ticks).reshape(each, len(candidates)).mean(axis=0)
 
 
-def optimise(config: SkillMimic, skill: str, generations: int, candidates: int, each: int, seed: int = 0) -> Correction:
-    """The best mean of the search's distribution, after ``generations``. Prints a line for each."""
+def optimise(
+    config: SkillMimic,
+    skill: str,
+    generations: int,
+    candidates: int,
+    each: int,
+    keep: Callable[[Correction], None],
+    seed: int = 0,
+) -> None:
+    """Search for ``generations``, each robot of ``each`` judging every candidate once a generation.
+
+    ``keep`` is given the middle of the search's distribution after every generation. Prints a line for each.
+    """
     config = dataclasses.replace(config, skills=(skill,), envs=candidates * each, anywhere=False, push_chance=0.0)
     graph = PolicyGraph(config)
-    clip = 0
-    ticks = ticks_of(graph, clip, SECONDS)
+    ticks = ticks_of(graph, 0, SECONDS)
     env = Env(dataclasses.replace(config, frames=ticks), seed, graph)
     search = Search(graph, 0)
     start = search.vector(plan.read(ROOT / (config.corrections or "none"), [skill], len(graph.acting))[0])
-    es = cma.CMAEvolutionStrategy(
-        start, 0.3, {"popsize": candidates - 1, "seed": seed + 1, "verbose": -9, "CMA_diagonal": 15}
-    )
-    for generation in range(generations):
+    options = {"popsize": candidates - 1, "seed": seed + 1, "verbose": -9, "CMA_diagonal": 15}
+    es = cma.CMAEvolutionStrategy(start, 0.3, options)
+    began = time.monotonic()
+    for generation in range(1, generations + 1):
         asked = es.ask()
         values = score(env, np.array([*asked, es.mean]), search, ticks)
         es.tell(asked, (-values[:-1]).tolist())
+        keep(search.correction(es.mean))
+        left = (time.monotonic() - began) / generation * (generations - generation) / 60
         print(
-            f"{skill}: {generation + 1}/{generations}, mean {values[-1]:.3f}, best {values.max():.3f}, sigma {es.sigma:.3f}",
+            f"{skill}: {generation} of {generations}, {left:.0f} min left; mean {values[-1]:.3f}, best {values.max():.3f},"
+            f" sigma {es.sigma:.3f}",
             flush=True,
         )
-    return search.correction(es.mean)
 
 
 def write(path: Path, skill: str, c: Correction) -> None:
@@ -140,8 +158,10 @@ def main() -> None:
     if arguments.skill not in config.skills or config.corrections is None:
         sys.exit(f"skill: got '{arguments.skill}', expected one of {', '.join(config.skills)}")
     torch.set_num_threads(1)
-    found = optimise(config, arguments.skill, arguments.generations, arguments.candidates, arguments.each)
-    write(ROOT / config.corrections, arguments.skill, found)
+    path, skill = ROOT / config.corrections, arguments.skill
+    optimise(
+        config, skill, arguments.generations, arguments.candidates, arguments.each, lambda c: write(path, skill, c)
+    )
 
 
 if __name__ == "__main__":

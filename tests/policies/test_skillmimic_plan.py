@@ -12,7 +12,7 @@ import yaml
 from policies.skillmimic.config import TASKS
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PULL, PolicyGraph
-from policies.skillmimic.optimise import Search, score, write
+from policies.skillmimic.optimise import Search, optimise, score, write
 from policies.skillmimic.plan import KNOTS, REACH, Correction, Plan, Rows, read
 from sim2real.types import Sim2realError
 
@@ -134,3 +134,13 @@ def test_a_candidate_that_drops_the_ball_scores_less(graph):
                             and any(p in n for p in ("shoulder", "elbow", "wrist"))], 6.0, 0.0)  # fmt: skip
     values = score(Env(config, 0, one), np.stack([still, apart]), search, 40)
     assert values[0] > 1.2 and values[1] < 0.6
+
+
+def test_a_search_keeps_what_it_has_found_after_every_generation(monkeypatch, capsys):
+    monkeypatch.setattr("policies.skillmimic.optimise.SECONDS", 0.2)
+    config = dataclasses.replace(TASKS["g1-ball"], clips=("hold_01",), threads=1)
+    found: list[Correction] = []
+    optimise(config, "hold", generations=2, candidates=4, each=2, keep=found.append)
+    assert len(found) == 2 and found[0].offsets.shape == (1, 14)
+    assert np.abs(found[1].offsets - found[0].offsets).max() > 0
+    assert "hold: 2 of 2, 0 min left" in capsys.readouterr().out
