@@ -236,7 +236,8 @@ def checks(
         ):
             yield (
                 f"{config.joint_names[left]} hangs at {q[left]:.2f} rad and {config.joint_names[right]} at {q[right]:.2f}, "
-                f"expected {'the same' if sign > 0 else 'opposites'} within {SYMMETRY:g}"
+                f"expected {'the same' if sign > 0 else 'opposites'} within {SYMMETRY:g}. Did one of them come down the other "
+                "way round (three axes reach every place twice)? Lay both down alike and start again: what is measured is kept"
             )
 
 
