@@ -60,7 +60,8 @@ class TickCodec(Protocol):
 class CanCodec(Protocol):
     """One protocol on CAN, for the n motors of one bus. Pure: frames in and out, no wire, no clock.
 
-    One whose tick is plain says in ``TICK`` which TickCodec it has for motors on several buses.
+    One whose tick is plain says in ``TICK`` which TickCodec it has for motors on several buses. One whose motors say
+    themselves how far their position can be trusted has in ``HOME`` the register, and by its value what TURN is.
     """
 
     TICK_BITS: tuple[float, float]  # bits of a motor's command and answer on the wire: typical, worst
@@ -151,6 +152,16 @@ class CanBus:
         rows = range(len(self.spec.motors))
         return [", ".join(f"{name} {values[row]:g}" if isinstance(values[row], float) else f"{name} {values[row]}"
                           for name, values in told.items()) for row in rows]  # fmt: skip
+
+    def turns(self) -> list[float]:
+        if self._clock is None:
+            raise BusError(f"bus {self.spec.name}: not connected; call connect(clock) first")
+        rows = range(len(self.spec.motors))
+        if (home := getattr(self._codec, "HOME", None)) is None:
+            return [self._codec.TURN for _ in rows]
+        register, turn = home
+        told = self._ask(RegisterCheck(register, np.full(len(rows), np.nan), ""), [], self._clock)
+        return [turn.get(told[row], np.nan) for row in rows]
 
     def close(self) -> None:
         self._wire.close()

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.budget import LOAD_MAX, budget
 from drivers.bus import BusError, Clock, MotorBus
-from drivers.open import PROTOCOLS, load
+from drivers.open import PROTOCOLS
 from sim2real.calibration import Calibration, is_needed
 from sim2real.config import RobotConfig, Wiring
 from sim2real.records import layout, state_fields, state_view
@@ -27,6 +27,7 @@ TRIP_MARGIN = 0.02  # s beyond a watchdog's time at which it must have tripped
 ANSWER_TIME = 0.06  # s to say so
 CLEAR_TIME = 0.5  # s to be off and without error again
 TURNS = range(-4, 5)  # that a motor may have lost or won since it was calibrated
+UNREFERENCED = "its motor says that its position is referenced to nothing: it needs an absolute encoder, or to be set"
 
 
 @dataclass
@@ -137,9 +138,12 @@ def turns(p: Preflight) -> Iterator[str]:
     """Whole turns that an encoder lost since the calibration are put back, where only one of them fits the joint."""
     s = p.look()
     shift = np.zeros(len(s.joint_pos))
-    turn = {m.joint: _turn_of(bus) for bus in p.robot.buses for m in bus.spec.motors}
+    turn = {m.joint: told for bus in p.robot.buses for m, told in zip(bus.spec.motors, bus.turns(), strict=True)}
     for i, joint in enumerate(p.config.joints):
         if not turn[joint.name]:
+            continue
+        if np.isnan(turn[joint.name]):
+            yield f"{joint.name}: {UNREFERENCED}"
             continue
         q, (low, high), margin = s.joint_pos[i], joint.position, p.config.safety.position_overrun
         shifts = [k * turn[joint.name] for k in TURNS]
@@ -149,7 +153,10 @@ def turns(p: Preflight) -> Iterator[str]:
             continue
         where = f"{joint.name}: reads {q:.3f} rad, its range is {low:g} to {high:g} rad"
         if fitting:
-            yield f"{where}: both {' and '.join(f'{q + x:.3f}' for x in fitting)} fit; move it to the middle of its range"
+            what = "move it to the middle of its range"
+            if high - low >= 2 * turn[joint.name]:
+                what = f"its motor knows only where in a turn of {turn[joint.name]:.3f} rad it is: give it an output encoder, or set its position"
+            yield f"{where}: {', '.join(f'{q + x:.3f}' for x in fitting)} fit; {what}"
         else:
             yield f"{where}: no whole turn brings it there"
     if shift.any():
@@ -210,12 +217,6 @@ def _trip(p: Preflight, watched: list[MotorBus]) -> Iterator[str]:
                     f"{m.joint}: {said} {clock.now() - spoken:.3f} s after the last word to it, expected its watchdog of "
                     f"{bus.spec.watchdog:g} s to stop it"
                 )
-
-
-def _turn_of(bus: MotorBus) -> float:
-    """rad by whose multiples the positions of a bus may be off; 0: unknown, or the maker sees to it."""
-    protocol = PROTOCOLS[bus.spec.protocol]
-    return 0.0 if protocol.calibrated else load(protocol.codec).TURN
 
 
 CALIBRATE = "`sim2real calibrate --robot ...` measures it"

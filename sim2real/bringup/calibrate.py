@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.bus import Clock
-from drivers.open import PROTOCOLS, load
 from sim2real.calibration import MotorCalibration
 from sim2real.config import RobotConfig, Wiring
+from sim2real.preflight import UNREFERENCED
 from sim2real.records import layout, state_fields, state_view
 from sim2real.robot import Robot
 from sim2real.types import RobotState, Sim2realError
@@ -51,8 +51,9 @@ class Motors:
         self.fingerprint: dict[str, str] = {}
         self.place: dict[str, tuple[str, int]] = {}  # bus and id
         for bus in robot.buses:
-            turn = load(PROTOCOLS[bus.spec.protocol].codec).TURN
-            for motor, fingerprint in zip(bus.spec.motors, bus.fingerprints(), strict=True):
+            for motor, fingerprint, turn in zip(bus.spec.motors, bus.fingerprints(), bus.turns(), strict=True):
+                if np.isnan(turn):
+                    raise Sim2realError(f"{motor.joint}: {UNREFERENCED}")
                 self.turn[motor.joint], self.fingerprint[motor.joint] = turn, fingerprint
                 self.place[motor.joint] = bus.spec.name, motor.id
 

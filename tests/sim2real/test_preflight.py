@@ -5,13 +5,16 @@ The robots are simulated down to their bytes, behind the same wires, buses and c
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from drivers.codecs.moteus import HomeState
 from drivers.open import open_world
+from drivers.sim.moteus import FIRST_SERIAL
 from sim2real.calibration import Calibration, MotorCalibration, load_calibration
 from sim2real.clock import SimClock
 from sim2real.config import RobotConfig, load_robot
@@ -41,8 +44,8 @@ class Rig:
         assert not self.world.motors.enabled.any()
 
 
-def rig(name: str = "bench", wiring: str = "", calibration: Calibration | None = None, **options) -> Rig:
-    config = load_robot(name)
+def rig(name: str | RobotConfig = "bench", wiring: str = "", calibration: Calibration | None = None, **options) -> Rig:
+    config = name if isinstance(name, RobotConfig) else load_robot(name)
     wiring = wiring or config.default_wiring
     wired = config.wiring(wiring)
     home = dict(zip(config.joint_names, config.home_pos, strict=True))
@@ -188,6 +191,68 @@ def test_a_joint_that_two_turns_bring_into_its_range_is_refused():
     r.preflight.calibration = measured(r.preflight.config, "can")
     r.world.plant.reset([2.0, 0.0])
     assert "shoulder_joint: reads" in (said := r.refusal()) and "fit; move it" in said and "elbow" not in said
+
+
+def moteus_bench() -> RobotConfig:
+    """The bench with moteus controllers, whose rotors turn six times for a turn of the joint."""
+    bench = load_robot("bench")
+    wiring = bench.wiring("can")
+    motors = [m.model_copy(update={"model": "qdd100-beta2", "feedback_id": 0}) for m in wiring.buses[0].motors]
+    bus = wiring.buses[0].model_copy(update={"protocol": "moteus", "data_bitrate": 5_000_000, "motors": motors})
+    return bench.model_copy(update={"wirings": {"can": wiring.model_copy(update={"buses": [bus]})}})
+
+
+ENCODER = {"motor_position.output.reference_source": 1.0, "motor_position.sources.1.reference": 1.0}
+
+
+def moteus_rig(*encoders: str, lost: float = 0.0, **options) -> Rig:
+    """``encoders``: the joints with one at the output; ``lost``: rad by which the elbow counted otherwise when it was
+    calibrated."""
+    config = moteus_bench()
+    calibration = measured(config, "can")
+    serials = [f"serial_number {moteus_serial(row)}" for row in range(2)]
+    calibration = calibration.model_copy(update={"motors": [
+        m.model_copy(update={"fingerprint": serial, "offset": m.offset + (lost if row else 0.0)})
+        for row, (m, serial) in enumerate(zip(calibration.motors, serials, strict=True))
+    ]})  # fmt: skip
+    return rig(config, calibration=calibration, registers={joint: ENCODER for joint in encoders}, **options)
+
+
+def moteus_serial(row: int) -> int:
+    return sum(word + row * (not i) << 32 * i for i, word in enumerate(FIRST_SERIAL))
+
+
+JOINTS = ("shoulder_joint", "elbow_joint")
+
+
+def test_a_moteus_that_knows_its_rotor_alone_is_refused_in_a_wide_joint():
+    said = moteus_rig("elbow_joint").refusal()
+    assert re.search(
+        r"shoulder_joint: reads .*, its range is -2 to 2 rad: [-.0-9]+, [-.0-9]+, [-.0-9]+, [-.0-9]+ fit; its motor",
+        said,
+    )
+    assert "knows only where in a turn of 1.047 rad it is: give it an output encoder" in said and "elbow" not in said
+
+
+@pytest.mark.parametrize("turns", [-1, 0, 1])
+def test_a_moteus_with_an_output_encoder_is_accepted(turns):
+    """It may have lost turns of the output, and those are put back."""
+    r = moteus_rig(*JOINTS, lost=turns * 2 * np.pi)
+    r.preflight.run()
+    assert r.told == ["whole turns put back since the calibration: elbow_joint"] * bool(turns)
+    np.testing.assert_allclose(r.preflight.look().joint_pos, r.world.plant.joint_pos, atol=0.01)
+
+
+def test_turns_of_a_rotor_are_not_put_back_where_the_output_is_known():
+    """An offset by a turn of the rotor is no lost turn then, but another zero."""
+    said = moteus_rig(*JOINTS, lost=4 * np.pi / 3).refusal()
+    assert "elbow_joint: reads" in said and "no whole turn brings it there" in said
+
+
+def test_a_moteus_whose_position_means_nothing_is_refused():
+    r = moteus_rig(*JOINTS)
+    r.world.motors._home_state = lambda row: HomeState.RELATIVE if row else HomeState.OUTPUT
+    assert "turns:\n  elbow_joint: its motor says that its position is referenced to nothing" in r.refusal()
 
 
 def test_another_variant_than_that_of_the_policies_is_refused():
