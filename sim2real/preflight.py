@@ -6,7 +6,7 @@ DEMANDS is the table, in its order. Motors are enabled once, without a target an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -111,8 +111,26 @@ def same_motors(p: Preflight) -> Iterator[str]:
             measured = p.calibration.motor(motor.joint)
             if measured and measured.fingerprint != fingerprint:
                 yield f"{motor.joint}: got motor {fingerprint}, expected {measured.fingerprint}, which was calibrated"
-        if not any(told):
-            p.tell(f"bus {bus.spec.name}: its motors have no serial number; one that was replaced goes unnoticed")
+        if warning := anonymous(bus, told):
+            p.tell(warning)
+
+
+def anonymous(bus: MotorBus, fingerprints: Sequence[str]) -> str:
+    """What to know about the motors of ``bus`` that tell no serial number, by their fingerprints; "": all do, or the robot's
+    maker calibrated it."""
+    protocol = PROTOCOLS[bus.spec.protocol]
+    names = [
+        m.joint for m, told in zip(bus.spec.motors, fingerprints, strict=True)
+        if not (protocol.serial and f"{protocol.serial} " in told)
+    ]  # fmt: skip
+    if protocol.calibrated or not names:
+        return ""
+    who = "its motors tell" if len(names) == len(fingerprints) else f"{', '.join(names)}: their motors tell"
+    by = "bus and id, and what they say of their make" if any(fingerprints) else "bus and id"
+    return (
+        f"bus {bus.spec.name}: {who} no serial number: the calibration knows them by {by} alone, and one that was replaced "
+        "by its like goes unnoticed. Calibrate again after replacing one"
+    )
 
 
 def variant(p: Preflight) -> Iterator[str]:
@@ -138,7 +156,15 @@ def turns(p: Preflight) -> Iterator[str]:
     """Whole turns that an encoder lost since the calibration are put back, where only one of them fits the joint."""
     s = p.look()
     shift = np.zeros(len(s.joint_pos))
-    turn = {m.joint: told for bus in p.robot.buses for m, told in zip(bus.spec.motors, bus.turns(), strict=True)}
+    turn: dict[str, float] = {}
+    for bus in p.robot.buses:
+        told = bus.turns()
+        turn |= {m.joint: t for m, t in zip(bus.spec.motors, told, strict=True)}
+        if not (PROTOCOLS[bus.spec.protocol].calibrated or any(told)):
+            p.tell(
+                f"bus {bus.spec.name}: its motors lose their zero without power, and cannot tell: were they without since "
+                "the calibration, calibrate again"
+            )
     for i, joint in enumerate(p.config.joints):
         if not turn[joint.name]:
             continue
@@ -191,6 +217,7 @@ def _trip(p: Preflight, watched: list[MotorBus]) -> Iterator[str]:
     while not all(s.enabled.all() for s in states) and clock.now() < end:
         for bus in watched:
             bus.enable()
+            bus.poll()  # some say only to a question whether they obey
         spoken = clock.now()
         clock.sleep_until(spoken + period)
         states = [bus.read(clock.now()) for bus in watched]

@@ -16,7 +16,7 @@ import numpy as np
 from drivers.bus import Clock
 from sim2real.calibration import MotorCalibration
 from sim2real.config import RobotConfig, Wiring
-from sim2real.preflight import UNREFERENCED
+from sim2real.preflight import UNREFERENCED, anonymous
 from sim2real.records import layout, state_fields, state_view
 from sim2real.robot import Robot
 from sim2real.types import RobotState, Sim2realError
@@ -50,8 +50,12 @@ class Motors:
         self.turn: dict[str, float] = {}
         self.fingerprint: dict[str, str] = {}
         self.place: dict[str, tuple[str, int]] = {}  # bus and id
+        self.warnings: list[str] = []  # of buses whose motors tell no serial number
         for bus in robot.buses:
-            for motor, fingerprint, turn in zip(bus.spec.motors, bus.fingerprints(), bus.turns(), strict=True):
+            fingerprints = bus.fingerprints()
+            if warning := anonymous(bus, fingerprints):
+                self.warnings.append(warning)
+            for motor, fingerprint, turn in zip(bus.spec.motors, fingerprints, bus.turns(), strict=True):
                 if np.isnan(turn):
                     raise Sim2realError(f"{motor.joint}: {UNREFERENCED}")
                 self.turn[motor.joint], self.fingerprint[motor.joint] = turn, fingerprint

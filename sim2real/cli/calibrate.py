@@ -128,6 +128,8 @@ def _check(calibration: Calibration, path: Path, motors: Motors, wiring: Wiring,
     for m in calibration.motors:
         table.add_row(m.joint, m.fingerprint or f"{m.bus}/{m.id}", f"{m.sign:+d}", f"{m.offset:.4f}", f"{m.span:.3f}")
     console.print(table)
+    for line in motors.warnings:
+        console.print(f"[yellow]know[/] {line}", highlight=False, soft_wrap=True)
     for line in contradictions:
         console.print(f"[red]contradicted[/] {line}", highlight=False, soft_wrap=True)
     if contradictions:

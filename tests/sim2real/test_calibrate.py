@@ -19,6 +19,7 @@ from sim2real.robot import open_robot
 from sim2real.types import Sim2realError
 
 FILE = "bringup/bench-can-sim.calibration.yaml"
+ROBOTS = Path(__file__).resolve().parents[2] / "configs" / "robots"
 
 
 @pytest.fixture(autouse=True)
@@ -223,6 +224,24 @@ def test_left_and_right_that_hang_otherwise_contradict():
     seen.joint_pos[config.joint_names.index("right_hip_pitch_joint")] = 0.4
     lines = list(checks(config, "imu_in_pelvis", calibration.motors, seen, np.array([1.0, 0, 0, 0])))
     assert not any("hangs at" in line for line in lines)
+
+
+def test_motors_that_tell_no_serial_number_are_named(capsys, tmp_path):
+    """Their calibration is bound to bus and id alone, which is said where it is written."""
+    text = (
+        (ROBOTS / "bench.yaml").read_text().replace("damiao", "mini_cheetah").replace("DM4310, id", "mini-cheetah, id")
+    )
+    text = (
+        text.replace("watchdog: 0.08", "watchdog: 0")
+        .replace(", feedback_id: 0x11", "")
+        .replace(", feedback_id: 0x12", "")
+    )
+    (tmp_path / "bench.yaml").write_text(text)
+    (tmp_path / "bench.xml").write_bytes((ROBOTS / "bench.xml").read_bytes())
+    assert main(["calibrate", "--robot", str(tmp_path / "bench.yaml"), "--sim"]) == 0
+    said = capsys.readouterr().out
+    assert "bus arm: its motors tell no serial number: the calibration knows them by bus and id alone" in said
+    assert [m.fingerprint for m in load_calibration(FILE).motors] == ["", ""]
 
 
 def test_a_robot_that_its_maker_calibrated_is_left_alone(capsys):

@@ -193,13 +193,13 @@ def test_a_joint_that_two_turns_bring_into_its_range_is_refused():
     assert "shoulder_joint: reads" in (said := r.refusal()) and "fit; move it" in said and "elbow" not in said
 
 
-def moteus_bench() -> RobotConfig:
-    """The bench with moteus controllers, whose rotors turn six times for a turn of the joint."""
+def bench_of(protocol: str, model: str, rate: float = 250.0, **changes: Any) -> RobotConfig:
+    """The bench with other motors."""
     bench = load_robot("bench")
     wiring = bench.wiring("can")
-    motors = [m.model_copy(update={"model": "qdd100-beta2", "feedback_id": 0}) for m in wiring.buses[0].motors]
-    bus = wiring.buses[0].model_copy(update={"protocol": "moteus", "data_bitrate": 5_000_000, "motors": motors})
-    return bench.model_copy(update={"wirings": {"can": wiring.model_copy(update={"buses": [bus]})}})
+    motors = [m.model_copy(update={"model": model, "feedback_id": 0}) for m in wiring.buses[0].motors]
+    bus = wiring.buses[0].model_copy(update={"protocol": protocol, "motors": motors} | changes)
+    return bench.model_copy(update={"wirings": {"can": wiring.model_copy(update={"buses": [bus], "rate": rate})}})
 
 
 ENCODER = {"motor_position.output.reference_source": 1.0, "motor_position.sources.1.reference": 1.0}
@@ -208,7 +208,7 @@ ENCODER = {"motor_position.output.reference_source": 1.0, "motor_position.source
 def moteus_rig(*encoders: str, lost: float = 0.0, **options) -> Rig:
     """``encoders``: the joints with one at the output; ``lost``: rad by which the elbow counted otherwise when it was
     calibrated."""
-    config = moteus_bench()
+    config = bench_of("moteus", "qdd100-beta2", data_bitrate=5_000_000)  # the rotor turns six times for the joint's one
     calibration = measured(config, "can")
     serials = [f"serial_number {moteus_serial(row)}" for row in range(2)]
     calibration = calibration.model_copy(update={"motors": [
@@ -253,6 +253,46 @@ def test_a_moteus_whose_position_means_nothing_is_refused():
     r = moteus_rig(*JOINTS)
     r.world.motors._home_state = lambda row: HomeState.RELATIVE if row else HomeState.OUTPUT
     assert "turns:\n  elbow_joint: its motor says that its position is referenced to nothing" in r.refusal()
+
+
+ANONYMOUS = {
+    "recoil": (
+        "6512",
+        0.08,
+        "",
+        ["FIRMWARE_VERSION 65793, FLUX_OFFSET 0.1", "FIRMWARE_VERSION 65793, FLUX_OFFSET 2.499"],
+    ),
+    "odrive": ("D6374-8:1", 0.0, "by bus and id alone", ["", ""]),
+    "mini_cheetah": ("mini-cheetah", 0.0, "by bus and id alone", ["", ""]),
+}
+
+
+@pytest.mark.parametrize("protocol", ANONYMOUS)
+def test_motors_without_a_serial_number_are_known_as_well_as_they_can_be_and_that_is_said(protocol):
+    model, watchdog, said, told = ANONYMOUS[protocol]
+    config = bench_of(protocol, model, watchdog=watchdog)
+    calibration = measured(config, "can")
+    calibration = calibration.model_copy(update={"motors": [
+        m.model_copy(update={"fingerprint": t}) for m, t in zip(calibration.motors, told, strict=True)
+    ]})  # fmt: skip
+    r = rig(config, calibration=calibration)
+    r.preflight.run()
+    warned = [text for text in r.told if "no serial number" in text]
+    assert len(warned) == bool(said) and all(said in text for text in warned)
+    assert any("its motors lose their zero without power, and cannot tell" in text for text in r.told)
+
+
+def test_a_recoil_motor_that_was_replaced_is_refused_by_what_its_calibration_measured():
+    config = bench_of("recoil", "6512")
+    calibration = measured(config, "can").model_copy()
+    told = ANONYMOUS["recoil"][3]
+    calibration = calibration.model_copy(update={"motors": [
+        m.model_copy(update={"fingerprint": t}) for m, t in zip(calibration.motors, told, strict=True)
+    ]})  # fmt: skip
+    said = rig(config, calibration=calibration, registers={"elbow_joint": {"FLUX_OFFSET": 1.25}}).refusal()
+    assert (
+        "elbow_joint: got motor FIRMWARE_VERSION 65793, FLUX_OFFSET 1.25, expected" in said and "shoulder" not in said
+    )
 
 
 def test_another_variant_than_that_of_the_policies_is_refused():
