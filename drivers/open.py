@@ -75,6 +75,7 @@ IMUS: dict[str, ImuProtocol] = {
     "hipnuc": ImuProtocol("drivers.codecs.hipnuc:Parser", "drivers.codecs.hipnuc:Sensor"),
     "witmotion": ImuProtocol("drivers.codecs.witmotion:Parser", "drivers.codecs.witmotion:Sensor"),
     "bno085": ImuProtocol("drivers.codecs.bno085:Parser", "drivers.codecs.bno085:Sensor"),
+    "bno085_shtp": ImuProtocol("drivers.codecs.bno085_shtp:Parser", "drivers.codecs.bno085_shtp:Sensor"),
     "unitree_hg": ImuProtocol("drivers.codecs.unitree_hg:ImuParser"),
 }
 

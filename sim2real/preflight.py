@@ -22,6 +22,7 @@ from sim2real.robot import Robot
 from sim2real.types import RobotState, Sim2realError
 
 LOOK_TIME = 0.1  # s of asking before everybody must be fresh
+IMU_TIME = 2.0  # s more for an IMU that has to be set up
 ENABLE_TIME = 0.3  # s for every motor to say that it is enabled
 TRIP_MARGIN = 0.02  # s beyond a watchdog's time at which it must have tripped
 ANSWER_TIME = 0.06  # s to say so
@@ -145,6 +146,8 @@ def variant(p: Preflight) -> Iterator[str]:
 def fresh(p: Preflight) -> Iterator[str]:
     """Everybody is heard now."""
     s, limits = p.look(round(LOOK_TIME * p.wiring.rate)), p.config.safety
+    if not s.imu_age <= limits.imu_age:  # one that must be told to speak takes its time
+        s = p.look(round(IMU_TIME * p.wiring.rate), lambda s: s.imu_age <= limits.imu_age)
     for joint, age, position in zip(p.config.joint_names, s.joint_age, s.joint_pos, strict=True):
         if not (age <= limits.joint_age and np.isfinite(position)):
             yield f"{joint}: last heard {age:.3g} s ago, expected at most {limits.joint_age:g} s"
