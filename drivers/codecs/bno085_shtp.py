@@ -1,7 +1,6 @@
 """BNO080, BNO085 and BNO086 in UART-SHTP mode (PS1 high, PS0 low; 3 Mbit/s): bytes to SI and back, and how they are set up.
+The line and its packets are in shtp.py.
 
-    line   = 7E | protocol: 0 control, 1 SHTP | bytes, where 7D and 7E are sent as 7D and the byte ^ 20 | 7E
-    SHTP   = length u16, header included | channel | sequence number of the channel | cargo
     cargo  = of channel 3: reports, one after the other: id | sequence number | status | delay | i16 ...
 
 Three reports make a sample: acceleration (01, 2^-8 m/s^2), angular velocity (02, 2^-9 rad/s) and the orientation without
@@ -14,8 +13,8 @@ to the sensor must be 100 us apart: one goes out at each call, so that this take
 **There is no checksum on this line.** A damaged length, channel or escape is found, a damaged value only where the quaternion's
 length is no longer 1. Keep the line short.
 
-Sources: CEVA/Hillcrest, "BNO08X Data Sheet" (1000-3927), 1.3.3, 1.4 and 5.2 (its figures 1-26 to 1-35, 5-1 and 5-2 are what
-the tests have); framing and the question for room: ceva-dsp/sh2-demo-nucleo, app/uart_hal.c.
+Source: CEVA/Hillcrest, "BNO08X Data Sheet" (1000-3927), 1.3.3, 1.4 and 5.2 (its figures 1-26 to 1-35, 5-1 and 5-2 are what
+the tests have).
 """
 
 from __future__ import annotations
@@ -26,22 +25,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-FLAG, ESCAPE, FLIP = 0x7E, 0x7D, 0x20
-CONTROL, SHTP = 0, 1  # protocols
-HEADER = 4
-FRAME_MAX = 1024  # bytes on the line, more than any sensor sends
+from drivers.codecs.shtp import CONTROL, FRAME_MAX, ROOM, Channel, Framer, Packet, line, pack
+
+SPACING = 100e-6  # s between two bytes to the sensor
 PATIENCE = 0.05  # s for an answer, before a question is put again
 SILENCE = 1.0  # s without a sample, after which the sensor is set up again
-CONTINUED = 0x8000  # of a length: the rest of a cargo, which this sensor is never asked for
-
-
-class Channel(IntEnum):
-    """What a cargo is about."""
-
-    COMMAND = 0
-    EXECUTABLE = 1  # to it: 1 reset; from it: 1 reset complete
-    CONTROL = 2
-    REPORTS = 3
 
 
 class Report(IntEnum):
@@ -68,8 +56,7 @@ FEATURE = np.dtype(
     [("report", "u1"), ("feature", "u1"), ("flags", "u1"), ("sensitivity", "<u2"), ("interval", "<u4"), ("batch", "<u4"),
      ("specific", "<u4")]
 )  # fmt: skip
-RESET_COMPLETE = b"\x01"
-ROOM = bytes([FLAG, CONTROL, FLAG])  # the question for it
+RESET = b"\x01"  # to the executable, and from it: it is complete
 
 
 class Sample(NamedTuple):
@@ -78,19 +65,6 @@ class Sample(NamedTuple):
     acceleration: np.ndarray  # (3,) m/s^2, +g upwards at rest
     angular_velocity: np.ndarray  # (3,) rad/s
     orientation: np.ndarray  # (4,) w, x, y, z
-
-
-def line(protocol: int, content: bytes) -> bytes:
-    """``content`` as it goes over the line."""
-    body = bytes([protocol]) + content
-    escaped = body.replace(b"\x7d", b"\x7d\x5d").replace(b"\x7e", b"\x7d\x5e")
-    return bytes([FLAG]) + escaped + bytes([FLAG])
-
-
-def pack(channel: Channel, sequence: int, cargo: bytes) -> bytes:
-    """An SHTP packet as it goes over the line."""
-    head = (HEADER + len(cargo)).to_bytes(2, "little") + bytes([channel, sequence & 0xFF])
-    return line(SHTP, head + cargo)
 
 
 def pack_feature(report: Report, interval: float, answer: bool = False) -> bytes:
@@ -114,47 +88,6 @@ def pack_reports(sample: Sample, sequence: int) -> bytes:
         numbers = np.clip(np.rint(np.asarray(values[report], float) / bit), -32768, 32767).astype("<i2")
         out += bytes([report, sequence & 0xFF, 3, 0]) + numbers.tobytes()  # status 3: accurate
     return out
-
-
-class Packet(NamedTuple):
-    """An SHTP packet; of the control protocol: channel -1."""
-
-    channel: int
-    cargo: bytes
-
-
-class Framer:
-    """Finds packets in a byte stream, on either side. Keeps at most FRAME_MAX bytes back."""
-
-    def __init__(self) -> None:
-        self._bytes = b""
-        self.rejected = 0  # frames that were none
-
-    def feed(self, data: bytes) -> Iterator[Packet]:
-        """Every packet completed by ``data``, oldest first."""
-        *frames, self._bytes = (self._bytes + data).split(bytes([FLAG]))
-        if len(self._bytes) > FRAME_MAX:
-            self._bytes = b""
-            self.rejected += 1
-        for frame in filter(None, frames):
-            if (packet := _unescaped(frame)) is None:
-                self.rejected += 1
-            else:
-                yield packet
-
-
-def _unescaped(frame: bytes) -> Packet | None:
-    """The packet between two flags; None: it is none."""
-    first, *rest = frame.split(bytes([ESCAPE]))
-    if not all(rest):  # nothing behind an escape
-        return None
-    content = first + b"".join(bytes([part[0] ^ FLIP]) + part[1:] for part in rest)
-    if content[:1] == bytes([CONTROL]) and len(content) in (1, 3):
-        return Packet(-1, content[1:])
-    length = int.from_bytes(content[1:3], "little")
-    if content[:1] != bytes([SHTP]) or len(content) <= 1 + HEADER or length != len(content) - 1:
-        return None
-    return Packet(content[3], content[1 + HEADER :])
 
 
 class Parser:
@@ -182,7 +115,7 @@ class Parser:
         for packet in self._framer.feed(data):
             if packet.channel == -1 and len(packet.cargo) == 2:
                 self._room = int.from_bytes(packet.cargo, "little")
-            elif packet.channel == Channel.EXECUTABLE and packet.cargo == RESET_COMPLETE:
+            elif packet.channel == Channel.EXECUTABLE and packet.cargo == RESET:
                 self._missing = list(WANTED)
             elif packet.channel == Channel.CONTROL and packet.cargo[0] == Report.FEATURE_ANSWER:
                 self._confirm(packet.cargo)
@@ -195,6 +128,8 @@ class Parser:
         """What to write to the sensor now (at most one byte), for samples at ``rate`` Hz."""
         if self._new:
             self._sampled, self._new = now, False
+        if self._bytes and now - self._spoke < SPACING:
+            return b""
         if self._bytes:
             byte, self._bytes = self._bytes[:1], self._bytes[1:]
             self._spoke = now
@@ -270,7 +205,7 @@ class Sensor:
         channel, cargo = packet
         if channel == -1 and not cargo:
             return line(CONTROL, FRAME_MAX.to_bytes(2, "little"))
-        if channel == Channel.EXECUTABLE and cargo == RESET_COMPLETE:
+        if channel == Channel.EXECUTABLE and cargo == RESET:
             self._intervals.clear()
             return self._greet()
         if channel == Channel.CONTROL and cargo[0] == Report.PRODUCT_QUESTION:
@@ -289,7 +224,7 @@ class Sensor:
     def _greet(self) -> bytes:
         """What a sensor says when it has started."""
         self._sequences = [0] * len(Channel)
-        return self._say(Channel.COMMAND, bytes([0])) + self._say(Channel.EXECUTABLE, RESET_COMPLETE)
+        return self._say(Channel.COMMAND, bytes([0])) + self._say(Channel.EXECUTABLE, RESET)
 
     def _say(self, channel: Channel, cargo: bytes) -> bytes:
         self._sequences[channel] += 1

@@ -248,6 +248,14 @@ def test_shtp_sets_its_sensor_up_a_byte_at_a_time_and_again_after_a_reset(tmp_pa
     assert world.time - heard < 0.01 and len(written) > count
 
 
+def test_shtp_leaves_its_sensor_time_between_bytes():
+    parser, said = bno085_shtp.Parser(), []
+    for k in range(2000):  # asked every 10 us
+        if parser.ask(1.0 + 1e-5 * k, 100.0):
+            said.append(k)
+    assert said and min(np.diff(said)) >= 10
+
+
 def test_shtp_asks_again_whom_it_does_not_hear(tmp_path):
     """A reset that it did not hear of: the greeting was lost."""
     world = make_world(tmp_path, imu=SHTP)

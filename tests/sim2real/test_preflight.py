@@ -147,6 +147,15 @@ def test_a_silent_imu_is_refused():
     assert "IMU: last heard inf s ago" in rig(faults=["off:imu"]).refusal()
 
 
+def test_an_imu_that_has_to_be_set_up_is_waited_for():
+    config = load_robot("bench")
+    wiring = config.wiring()
+    imu = wiring.imu.model_copy(update={"protocol": "bno085_shtp", "baud": 3_000_000, "rate": 400.0})
+    r = rig(config.model_copy(update={"wirings": {"can": wiring.model_copy(update={"imu": imu})}}))
+    r.preflight.run()
+    r.unmoved()
+
+
 def test_a_watchdog_that_does_not_trip_is_refused_by_name():
     r = rig()
     trip = r.world.motors._trip
