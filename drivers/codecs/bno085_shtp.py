@@ -51,7 +51,8 @@ WANTED = {  # report: (numbers, of one bit in SI)
     Report.ANGULAR_VELOCITY: (3, 2.0**-9),
     Report.ORIENTATION: (4, 2.0**-14),
 }
-LENGTHS = {r: 4 + 2 * numbers for r, (numbers, _) in WANTED.items()} | {Report.TIME_BASE: 5, Report.REBASE: 5}
+LENGTHS = {int(r): 4 + 2 * numbers for r, (numbers, _) in WANTED.items()}
+LENGTHS |= {int(r): 5 for r in (Report.TIME_BASE, Report.REBASE)}
 FEATURE = np.dtype(
     [("report", "u1"), ("feature", "u1"), ("flags", "u1"), ("sensitivity", "<u2"), ("interval", "<u4"), ("batch", "<u4"),
      ("specific", "<u4")]
