@@ -167,6 +167,11 @@ class MotorBus(Protocol):
         Once connected, and disabled; blocks as ``connect`` does. Raises BusError."""
         ...
 
+    def turns(self) -> list[float]:
+        """rad by whose multiples each motor's position may be off since it was calibrated. 0: the maker sees to it, or
+        nobody knows; NaN: the motor says that its position means nothing. As ``fingerprints``."""
+        ...
+
     def close(self) -> None: ...
 
 

@@ -60,11 +60,13 @@ class TickCodec(Protocol):
 class CanCodec(Protocol):
     """One protocol on CAN, for the n motors of one bus. Pure: frames in and out, no wire, no clock.
 
-    One whose tick is plain says in ``TICK`` which TickCodec it has for motors on several buses.
+    One whose tick is plain says in ``TICK`` which TickCodec it has for motors on several buses. One whose motors say
+    themselves how far their position can be trusted has in ``HOME`` the register, and by its value what TURN is. ``NEWER``:
+    of IDENTITY, those that older firmware does not answer.
     """
 
     TICK_BITS: tuple[float, float]  # bits of a motor's command and answer on the wire: typical, worst
-    IDENTITY: tuple[str, ...]  # registers that tell a motor from any other
+    IDENTITY: tuple[str, ...]  # registers that tell a motor from any other, or at least from one of another make
     TURN: float  # rad by whose multiples a position may be off after power-on; 0: nobody knows where it starts
     checks: list[RegisterCheck]
 
@@ -146,11 +148,28 @@ class CanBus:
     def fingerprints(self) -> list[str]:
         if self._clock is None:
             raise BusError(f"bus {self.spec.name}: not connected; call connect(clock) first")
-        unknown = np.full(len(self.spec.motors), np.nan)
-        told = {name: self._ask(RegisterCheck(name, unknown, ""), [], self._clock) for name in self._codec.IDENTITY}
-        rows = range(len(self.spec.motors))
-        return [", ".join(f"{name} {values[row]:g}" if isinstance(values[row], float) else f"{name} {values[row]}"
-                          for name, values in told.items()) for row in rows]  # fmt: skip
+        told: dict[int, list[str]] = {row: [] for row in range(len(self.spec.motors))}
+        newer = getattr(self._codec, "NEWER", ())
+        for name in self._codec.IDENTITY:
+            values = self._ask(RegisterCheck(name, self._unknown, ""), [], self._clock, required=name not in newer)
+            for row, value in values.items():
+                told[row].append(f"{name} {value:g}" if isinstance(value, float) else f"{name} {value}")
+            if len(values) < len(told):
+                break  # what comes next is newer still
+        return [", ".join(words) for words in told.values()]
+
+    def turns(self) -> list[float]:
+        if self._clock is None:
+            raise BusError(f"bus {self.spec.name}: not connected; call connect(clock) first")
+        if (home := getattr(self._codec, "HOME", None)) is None:
+            return [self._codec.TURN for _ in self.spec.motors]
+        register, turn = home
+        told = self._ask(RegisterCheck(register, self._unknown, ""), [], self._clock)
+        return [turn.get(told[row], np.nan) for row in range(len(self.spec.motors))]
+
+    @property
+    def _unknown(self) -> np.ndarray:
+        return np.full(len(self.spec.motors), np.nan)
 
     def close(self) -> None:
         self._wire.close()
@@ -218,8 +237,10 @@ class CanBus:
         if wrong:
             raise BusError("\n".join(wrong) + f"\n  {check.consequence}")
 
-    def _ask(self, check: RegisterCheck, expected: list[float], clock: Clock) -> dict[int, float | int]:
-        """What every motor's register holds, {row: value}. What is to be written goes ahead of each question, until it
+    def _ask(
+        self, check: RegisterCheck, expected: list[float], clock: Clock, required: bool = True
+    ) -> dict[int, float | int]:
+        """What every motor's register holds, {row: value}; not ``required``: only of those that say it. What is to be written goes ahead of each question, until it
         has arrived: not every protocol confirms a write, and any frame may get lost."""
         answers: dict[int, float | int] = {}
         motors = range(len(self.spec.motors))
@@ -243,7 +264,7 @@ class CanBus:
             return all(map(settled, motors))
 
         self._converse(request, take, clock)
-        if silent := [row for row in motors if row not in answers]:
+        if required and (silent := [row for row in motors if row not in answers]):
             self._refuse_silence(silent, f"a request for register {check.register}")
         return answers
 

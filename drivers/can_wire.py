@@ -12,12 +12,25 @@ from typing import Any
 
 import numpy as np
 
-from drivers.wire import BIT_RATE_SWITCH, ERROR, EXTENDED, FD_FRAME, FRAME, REMOTE, WireError, WireFull, WireGone
+from drivers.wire import (
+    BIT_RATE_SWITCH,
+    BUS_OFF,
+    CONTROLLER,
+    ERROR,
+    EXTENDED,
+    FD_FRAME,
+    FRAME,
+    REMOTE,
+    RESTARTED,
+    WireError,
+    WireFull,
+    WireGone,
+)
 
 ID_MASK = 0x1FFF_FFFF
 GONE = (errno.ENODEV, errno.ENXIO, errno.EBADF)  # the interface was unregistered, not only set down
 CAN_RAW_ERR_FILTER, CAN_RAW_FD_FRAMES = 2, 5  # linux/can/raw.h
-ERRORS_HEARD = 0x04 | 0x40 | 0x100  # linux/can/error.h: controller problems, bus-off, restarted
+ERRORS_HEARD = CONTROLLER | BUS_OFF | RESTARTED
 
 
 def interfaces() -> list[str]:

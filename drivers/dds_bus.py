@@ -110,6 +110,10 @@ class DdsBus:
         """Nothing: LowState tells the robot's variant, and no serial number."""
         return [""] * len(self.spec.motors)
 
+    def turns(self) -> list[float]:
+        """The robot itself sees to it."""
+        return [0.0] * len(self.spec.motors)
+
     @property
     def variant(self) -> int | None:
         """The robot's mode_machine, once it was heard."""

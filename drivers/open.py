@@ -21,23 +21,24 @@ class BusProtocol(NamedTuple):
     motors: str = ""
     watchdog: bool = True  # connecting programs one
     calibrated: bool = False  # the maker did it: positions are those of the joints
+    serial: str = ""  # what of a motor's fingerprint is its serial number; "": it tells none
 
 
-def _can(name: str, codec: str, watchdog: bool = True) -> BusProtocol:
+def _can(name: str, codec: str, watchdog: bool = True, serial: str = "") -> BusProtocol:
     """A protocol on CanBus: its codec, and in drivers/sim its motors, are files of its ``name``."""
     codec_path, motors_path = f"drivers.codecs.{name}:{codec}Codec", f"drivers.sim.{name}:Sim{codec}"
-    return BusProtocol("can", "drivers.can_bus:CanBus", codec_path, motors_path, watchdog)
+    return BusProtocol("can", "drivers.can_bus:CanBus", codec_path, motors_path, watchdog, serial=serial)
 
 
 PROTOCOLS: dict[str, BusProtocol] = {
-    "damiao": _can("damiao", "Damiao"),
-    "robstride": _can("robstride", "Robstride"),
-    "recoil": _can("recoil", "Recoil"),
+    "damiao": _can("damiao", "Damiao", serial="SN"),
+    "robstride": _can("robstride", "Robstride", serial="MCU_UID"),
+    "recoil": _can("recoil", "Recoil", serial="FLUX_OFFSET"),
     "mini_cheetah": _can("mini_cheetah", "MiniCheetah", watchdog=False),
     "cubemars": _can("cubemars", "Cubemars", watchdog=False),
     "robstride_mit": _can("robstride_mit", "RobstrideMit", watchdog=False),
-    "odrive": _can("odrive", "Odrive", watchdog=False),
-    "moteus": _can("moteus", "Moteus"),
+    "odrive": _can("odrive", "Odrive", watchdog=False, serial="SERIAL"),
+    "moteus": _can("moteus", "Moteus", serial="serial_number"),
     "dynamixel": BusProtocol(
         "serial",
         "drivers.serial_bus:SerialBus",
@@ -74,6 +75,7 @@ IMUS: dict[str, ImuProtocol] = {
     "hipnuc": ImuProtocol("drivers.codecs.hipnuc:Parser", "drivers.codecs.hipnuc:Sensor"),
     "witmotion": ImuProtocol("drivers.codecs.witmotion:Parser", "drivers.codecs.witmotion:Sensor"),
     "bno085": ImuProtocol("drivers.codecs.bno085:Parser", "drivers.codecs.bno085:Sensor"),
+    "bno085_shtp": ImuProtocol("drivers.codecs.bno085_shtp:Parser", "drivers.codecs.bno085_shtp:Sensor"),
     "unitree_hg": ImuProtocol("drivers.codecs.unitree_hg:ImuParser"),
 }
 

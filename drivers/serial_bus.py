@@ -283,6 +283,9 @@ class SerialBus:
             ", ".join(f"{name} {values[row]}" for name, values in told.items()) for row in range(len(self.spec.motors))
         ]
 
+    def turns(self) -> list[float]:
+        return [self._codec.TURN] * len(self.spec.motors)
+
     def close(self) -> None:
         self._wire.close()
 

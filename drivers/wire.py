@@ -14,6 +14,9 @@ import numpy as np
 EXTENDED = 0x8000_0000  # bit 31 of ``id``: 29-bit identifier (CAN_EFF_FLAG)
 REMOTE = 0x4000_0000  # bit 30: remote request (CAN_RTR_FLAG)
 ERROR = 0x2000_0000  # bit 29: error frame (CAN_ERR_FLAG)
+# Of an error frame's ``id``: what the controller says of itself (linux/can/error.h). CONTROLLER: and in data[1], how it is.
+CONTROLLER, BUS_OFF, RESTARTED = 0x04, 0x40, 0x100
+ERROR_PASSIVE = 0x30  # of data[1]: receiving 10, transmitting 20
 
 FRAME = np.dtype(
     [("id", "<u4"), ("length", "u1"), ("pad", "u1", (3,)), ("data", "u1", (8,))]

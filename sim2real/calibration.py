@@ -2,6 +2,10 @@
 
 ``sim2real calibrate`` measures it and writes it; ``sim2real deploy --hardware`` demands it. It belongs to one robot, one
 wiring, the motors by their serial numbers, and the joint ranges of the YAML by which it was measured.
+
+What a motor tells of itself is in its protocol's IDENTITY: a serial number (Damiao, RobStride, moteus, ODrive from firmware 0.6
+on), what its own calibration measured (Recoil), its model and firmware (Dynamixel, Feetech), or nothing (ODrive 0.5, MIT
+mode). Without a serial number bus, id and make are all that binds it: calibrating and arming say so.
 """
 
 from __future__ import annotations

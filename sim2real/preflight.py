@@ -6,7 +6,7 @@ DEMANDS is the table, in its order. Motors are enabled once, without a target an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.budget import LOAD_MAX, budget
 from drivers.bus import BusError, Clock, MotorBus
-from drivers.open import PROTOCOLS, load
+from drivers.open import PROTOCOLS
 from sim2real.calibration import Calibration, is_needed
 from sim2real.config import RobotConfig, Wiring
 from sim2real.records import layout, state_fields, state_view
@@ -22,11 +22,13 @@ from sim2real.robot import Robot
 from sim2real.types import RobotState, Sim2realError
 
 LOOK_TIME = 0.1  # s of asking before everybody must be fresh
+IMU_TIME = 2.0  # s more for an IMU that has to be set up
 ENABLE_TIME = 0.3  # s for every motor to say that it is enabled
 TRIP_MARGIN = 0.02  # s beyond a watchdog's time at which it must have tripped
 ANSWER_TIME = 0.06  # s to say so
 CLEAR_TIME = 0.5  # s to be off and without error again
 TURNS = range(-4, 5)  # that a motor may have lost or won since it was calibrated
+UNREFERENCED = "its motor says that its position is referenced to nothing: it needs an absolute encoder, or to be set"
 
 
 @dataclass
@@ -110,8 +112,26 @@ def same_motors(p: Preflight) -> Iterator[str]:
             measured = p.calibration.motor(motor.joint)
             if measured and measured.fingerprint != fingerprint:
                 yield f"{motor.joint}: got motor {fingerprint}, expected {measured.fingerprint}, which was calibrated"
-        if not any(told):
-            p.tell(f"bus {bus.spec.name}: its motors have no serial number; one that was replaced goes unnoticed")
+        if warning := anonymous(bus, told):
+            p.tell(warning)
+
+
+def anonymous(bus: MotorBus, fingerprints: Sequence[str]) -> str:
+    """What to know about the motors of ``bus`` that tell no serial number, by their fingerprints; "": all do, or the robot's
+    maker calibrated it."""
+    protocol = PROTOCOLS[bus.spec.protocol]
+    names = [
+        m.joint for m, told in zip(bus.spec.motors, fingerprints, strict=True)
+        if not (protocol.serial and f"{protocol.serial} " in told)
+    ]  # fmt: skip
+    if protocol.calibrated or not names:
+        return ""
+    who = "its motors tell" if len(names) == len(fingerprints) else f"{', '.join(names)}: their motors tell"
+    by = "bus and id, and what they say of their make" if any(fingerprints) else "bus and id"
+    return (
+        f"bus {bus.spec.name}: {who} no serial number: the calibration knows them by {by} alone, and one that was replaced "
+        "by its like goes unnoticed. Calibrate again after replacing one"
+    )
 
 
 def variant(p: Preflight) -> Iterator[str]:
@@ -126,6 +146,8 @@ def variant(p: Preflight) -> Iterator[str]:
 def fresh(p: Preflight) -> Iterator[str]:
     """Everybody is heard now."""
     s, limits = p.look(round(LOOK_TIME * p.wiring.rate)), p.config.safety
+    if not s.imu_age <= limits.imu_age:  # one that must be told to speak takes its time
+        s = p.look(round(IMU_TIME * p.wiring.rate), lambda s: s.imu_age <= limits.imu_age)
     for joint, age, position in zip(p.config.joint_names, s.joint_age, s.joint_pos, strict=True):
         if not (age <= limits.joint_age and np.isfinite(position)):
             yield f"{joint}: last heard {age:.3g} s ago, expected at most {limits.joint_age:g} s"
@@ -137,9 +159,20 @@ def turns(p: Preflight) -> Iterator[str]:
     """Whole turns that an encoder lost since the calibration are put back, where only one of them fits the joint."""
     s = p.look()
     shift = np.zeros(len(s.joint_pos))
-    turn = {m.joint: _turn_of(bus) for bus in p.robot.buses for m in bus.spec.motors}
+    turn: dict[str, float] = {}
+    for bus in p.robot.buses:
+        told = bus.turns()
+        turn |= {m.joint: t for m, t in zip(bus.spec.motors, told, strict=True)}
+        if not (PROTOCOLS[bus.spec.protocol].calibrated or any(told)):
+            p.tell(
+                f"bus {bus.spec.name}: its motors lose their zero without power, and cannot tell: were they without since "
+                "the calibration, calibrate again"
+            )
     for i, joint in enumerate(p.config.joints):
         if not turn[joint.name]:
+            continue
+        if np.isnan(turn[joint.name]):
+            yield f"{joint.name}: {UNREFERENCED}"
             continue
         q, (low, high), margin = s.joint_pos[i], joint.position, p.config.safety.position_overrun
         shifts = [k * turn[joint.name] for k in TURNS]
@@ -149,7 +182,10 @@ def turns(p: Preflight) -> Iterator[str]:
             continue
         where = f"{joint.name}: reads {q:.3f} rad, its range is {low:g} to {high:g} rad"
         if fitting:
-            yield f"{where}: both {' and '.join(f'{q + x:.3f}' for x in fitting)} fit; move it to the middle of its range"
+            what = "move it to the middle of its range"
+            if high - low >= 2 * turn[joint.name]:
+                what = f"its motor knows only where in a turn of {turn[joint.name]:.3f} rad it is: give it an output encoder, or set its position"
+            yield f"{where}: {', '.join(f'{q + x:.3f}' for x in fitting)} fit; {what}"
         else:
             yield f"{where}: no whole turn brings it there"
     if shift.any():
@@ -184,6 +220,7 @@ def _trip(p: Preflight, watched: list[MotorBus]) -> Iterator[str]:
     while not all(s.enabled.all() for s in states) and clock.now() < end:
         for bus in watched:
             bus.enable()
+            bus.poll()  # some say only to a question whether they obey
         spoken = clock.now()
         clock.sleep_until(spoken + period)
         states = [bus.read(clock.now()) for bus in watched]
@@ -210,12 +247,6 @@ def _trip(p: Preflight, watched: list[MotorBus]) -> Iterator[str]:
                     f"{m.joint}: {said} {clock.now() - spoken:.3f} s after the last word to it, expected its watchdog of "
                     f"{bus.spec.watchdog:g} s to stop it"
                 )
-
-
-def _turn_of(bus: MotorBus) -> float:
-    """rad by whose multiples the positions of a bus may be off; 0: unknown, or the maker sees to it."""
-    protocol = PROTOCOLS[bus.spec.protocol]
-    return 0.0 if protocol.calibrated else load(protocol.codec).TURN
 
 
 CALIBRATE = "`sim2real calibrate --robot ...` measures it"

@@ -16,6 +16,10 @@ Any command makes a stopped controller obey. So a motor is commanded only after 
 obeys or is about to: one that left UNANSWERED_MAX commands without such an answer is only asked until it gives one, and one
 that obeyed and then says that it is stopped was reset, and is only asked until it is enabled again.
 
+What its position is worth after power-on, a controller says in register 00C (HOME_STATE): referenced to the rotor, whose
+turns are lost; or to the output, by an encoder there or because somebody set it since ("set output nearest"); or to nothing.
+That somebody set another zero than the one that was calibrated, nothing tells.
+
 Every command carries the watchdog's time. On expiry the controller goes to mode 11 (timeout), where it damps with its own kd,
 and stays there until it is told to stop.
 
@@ -95,6 +99,14 @@ class Mode(IntEnum):
     BRAKE = 15
 
 
+class HomeState(IntEnum):
+    """Register 00C: to what the position is referenced."""
+
+    RELATIVE = 0  # nothing: it began where it was switched on
+    ROTOR = 1
+    OUTPUT = 2
+
+
 READY = (Mode.ENABLING, Mode.CALIBRATING, Mode.CALIBRATED, Mode.POSITION)  # obeys, or is about to
 TIMED_OUT = 0x100  # as MotorState.error; below it: register 00F
 
@@ -139,7 +151,10 @@ ANSWER_HEADS = {
 STOP = bytes([WRITE | 1, Register.MODE, Mode.STOPPED, *QUESTIONS])  # 9 bytes: padded to 12
 SERIAL = "serial_number"  # no name of the configuration: registers 120 to 122
 ASK_SERIAL = bytes([READ | Resolution.INT32 << 2 | 3]) + varuint(Register.SERIAL_NUMBER)
+HOME = "home_state"  # register 00C
+ASK_HOME = bytes([READ | 1, Register.HOME_STATE])
 ASK_FIRMWARE = bytes([READ | Resolution.INT32 << 2 | 1]) + varuint(Register.FIRMWARE)
+QUESTION_OF = {SERIAL: ASK_SERIAL, HOME: ASK_HOME}
 HEARING = bytes([CONSOLE_READ, CONSOLE, CONSOLE_MAX])
 
 
@@ -254,7 +269,8 @@ class MoteusCodec:
     # frames (id above 7; else 22 bits less), and the most that stuffing can make of them (one for every four bits).
     TICK_BITS = (244.0, 271.6)
     IDENTITY = (SERIAL,)
-    TURN = 2 * np.pi / 6  # of the output, in one turn of the rotor, whose encoder is all that there is; of all MODELS
+    TURN = 2 * np.pi / 6  # of the output, in one turn of the rotor; of all MODELS
+    HOME = HOME, {HomeState.RELATIVE: np.nan, HomeState.ROTOR: TURN, HomeState.OUTPUT: 2 * np.pi}
 
     def __init__(self, spec: BusSpec) -> None:
         """Raises BusError for an unknown model, an id that cannot be, or a bus without CAN-FD."""
@@ -320,15 +336,15 @@ class MoteusCodec:
         return self._frames(bytes(QUESTIONS))
 
     def pack_register(self, row: int, register: str, value: float | int | None = None) -> np.ndarray:
-        """Write a configuration value, or ask for it and fetch what the console has to say; or ask for SERIAL.
+        """Write a configuration value, or ask for it and fetch what the console has to say; or ask for SERIAL or HOME.
 
         The console's answers do not tell what they answer, so that only one question is out at a time: it is put again
         when its answer was fetched twice and did not come, and before that only fetched.
         """
         if value is not None:
             return self._type(row, f"conf set {register} {value:.9g}\n")
-        if register == SERIAL:
-            return pack_question(self._spec.motors[row].id, ASK_SERIAL)
+        if register in QUESTION_OF:
+            return pack_question(self._spec.motors[row].id, QUESTION_OF[register])
         asked, fetched = self._asked[row]
         fetch = make_fd_frames(self._ids[row : row + 1], np.frombuffer(HEARING, np.uint8)[None], len(HEARING))
         if asked == register and fetched < 2:
@@ -342,7 +358,7 @@ class MoteusCodec:
         return make_fd_frames(self._silent_ids[row : row + 1], payload[None], len(payload))
 
     def unpack_registers(self, frames: np.ndarray) -> list[RegisterAnswer]:
-        """What the consoles said of what was asked for, and serial numbers. OK confirms a write; ERR stands for a value
+        """What the consoles said of what was asked for, serial numbers and home states. OK confirms a write; ERR stands for a value
         that there is not."""
         answers = []
         rows = self.owners(frames)
@@ -350,6 +366,8 @@ class MoteusCodec:
             payload = frame["data"][: frame["length"]].tobytes()
             if (serial := _serial_number(payload)) is not None:
                 answers.append(RegisterAnswer(row, SERIAL, serial, False))
+            if (home := _home_state(payload)) is not None:
+                answers.append(RegisterAnswer(row, HOME, home, False))
             for text in _console_texts(payload):
                 *lines, self._said[row] = (self._said[row] + text)[-1024:].split(b"\n")
                 for line in lines:
@@ -415,6 +433,16 @@ def _serial_number(payload: bytes) -> int | None:
         return serial_number(payload)
     except ValueError:
         return None
+
+
+def _home_state(payload: bytes) -> int | None:
+    try:
+        for s in subframes(payload):
+            if (s.type, s.first, s.count, s.resolution) == (REPLY, Register.HOME_STATE, 1, Resolution.INT8):
+                return int(s.values[0])
+    except ValueError:
+        pass
+    return None
 
 
 def _console_texts(payload: bytes) -> list[bytes]:

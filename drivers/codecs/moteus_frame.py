@@ -87,6 +87,8 @@ class Register(IntEnum):
     COMMAND_ACCELERATION_LIMIT = 0x029
     FIRMWARE = 0x101  # a byte each of major, minor, micro
     SERIAL_NUMBER = 0x120  # 96 bits in three registers, least significant first
+    SET_OUTPUT_NEAREST = 0x130  # written: the position is this, up to a whole number of turns of the rotor
+    SET_OUTPUT_EXACT = 0x131  # written: the position is this
 
 
 R = Register
@@ -115,6 +117,8 @@ KINDS: dict[int, str] = {
     R.COMMAND_TIMEOUT: "s",
     R.COMMAND_VELOCITY_LIMIT: "rev/s",
     R.COMMAND_ACCELERATION_LIMIT: "rev/s^2",
+    R.SET_OUTPUT_NEAREST: "rev",
+    R.SET_OUTPUT_EXACT: "rev",
 }
 
 

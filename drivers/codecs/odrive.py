@@ -21,7 +21,12 @@ The watchdog (axis.config.enable_watchdog, watchdog_timeout) is fed by every fra
 set by USB. On expiry the axis goes idle (limp) with an error, until CLEAR_ERRORS. A wiring of these motors must say
 ``watchdog: 0``.
 
-Source: odriverobotics/ODrive, Firmware/communication/can/can_simple.cpp and tools/odrive-cansimple.dbc (0.5.4).
+Firmware 0.5 tells nobody its serial number. Newer firmware does, to a question that goes to everybody (node 3F) and that 0.5
+would take for a new node id. So first each axis is asked for its version, to which 0.5 is silent, and only where all of a bus
+have 0.6 or more, for its address.
+
+Source: odriverobotics/ODrive, Firmware/communication/can/can_simple.cpp and tools/odrive-cansimple.dbc (0.5.4); for version
+and address docs.odriverobotics.com, "CAN Protocol" (0.6), and its tool can_enumerate.py.
 """
 
 from __future__ import annotations
@@ -39,6 +44,8 @@ from drivers.wire import ERROR, EXTENDED, FRAME, REMOTE, make_frames
 
 COMMAND_BITS = 5
 NODE_MAX = 63
+BROADCAST = 0x3F  # since firmware 0.6: everybody
+MODERN = 0, 6  # firmware that tells its serial number
 TURN = 2 * np.pi
 THOUSANDTH = 1e-3  # rev/s and N m, of the 16-bit numbers in SET_INPUT_POS
 POS_GAIN_MAX = 1000.0  # 1/s
@@ -66,11 +73,15 @@ MODELS: dict[str, Model] = {
 class Command(IntEnum):
     """Low five bits of an identifier."""
 
+    GET_VERSION = (
+        0x00  # 0.6: protocol, hardware major, minor, variant, firmware major, minor, revision, unreleased; u1 each
+    )
     HEARTBEAT = 0x01  # error u4, state u1, flags
     ESTOP = 0x02
     GET_MOTOR_ERROR = 0x03
     GET_ENCODER_ERROR = 0x04
     SET_NODE_ID = 0x06
+    ADDRESS = 0x06  # 0.6: node u1, serial number u6, and perhaps one byte more
     SET_AXIS_STATE = 0x07  # u4
     GET_ENCODER_ESTIMATES = 0x09  # f4 rev, f4 rev/s
     SET_CONTROLLER_MODE = 0x0B  # control u4, input u4
@@ -170,7 +181,7 @@ class OdriveCodec:
         135.0 + 55.0 + 135.0 + (55.0 + 135.0) / 3 + 135.0 / 2,
     )
     TICK_OVERHEAD_BITS = 119.2
-    IDENTITY = ()
+    IDENTITY = NEWER = ("VERSION", "SERIAL")
     TURN = 0.0  # the count of the motor's own turns is lost, and with it the joint's zero
     MOTOR_FRAMES = 3 + 2 / 3 + 1 / 2
 
@@ -188,6 +199,7 @@ class OdriveCodec:
         self._gains = np.full((2, n), np.nan)  # pos_gain, vel_gain that each axis was last told
         self._turn = 0
         self._alive = np.zeros(n, bool)  # has sent a heartbeat
+        self._modern = np.zeros(n, bool)  # has told its version, which is 0.6 or more
 
     def _all(self, command: Command, data: np.ndarray) -> np.ndarray:
         """The command to every node (FRAME, (n,)); ``data`` (n, 8) or (8,) uint8."""
@@ -263,10 +275,29 @@ class OdriveCodec:
         return self._pack_questions()
 
     def pack_register(self, row: int, register: str, value: float | int | None = None) -> np.ndarray:
-        raise KeyError(register)  # there are none
+        """A question for VERSION (FRAME, (1,)), or for SERIAL to everybody (none, as long as somebody may have firmware 0.5)."""
+        if value is not None or register not in self.IDENTITY:
+            raise KeyError(register)
+        if register == "SERIAL" and not self._modern.all():
+            return np.zeros(0, FRAME)
+        id = identifier(
+            *((BROADCAST, Command.ADDRESS) if register == "SERIAL" else (self._nodes[row], Command.GET_VERSION))
+        )
+        return make_frames(np.array([REMOTE | id]), np.zeros((1, 8), np.uint8), 0)
 
     def unpack_registers(self, frames: np.ndarray) -> list[RegisterAnswer]:
-        return []
+        """Versions and serial numbers among ``frames``."""
+        answers = []
+        rows, commands = self._sort(frames)
+        for row, command, frame in zip(rows.tolist(), commands.tolist(), frames, strict=True):
+            data = frame["data"].tobytes()
+            if row >= 0 and command == Command.GET_VERSION:
+                major, minor, revision = data[4:7]
+                self._modern[row] = (major, minor) >= MODERN
+                answers.append(RegisterAnswer(row, "VERSION", major << 16 | minor << 8 | revision, False))
+            elif row >= 0 and command == Command.ADDRESS and data[0] == self._nodes[row]:
+                answers.append(RegisterAnswer(row, "SERIAL", int.from_bytes(data[1:7], "little"), False))
+        return answers
 
     def unpack(self, frames: np.ndarray, state: MotorState, now: float) -> int:
         """Put heartbeats, estimates and currents into ``state``, the latest of each motor last. Returns how many frames
@@ -298,7 +329,8 @@ class OdriveCodec:
         ids = frames["id"].astype(np.int64)
         commands = ids & (1 << COMMAND_BITS) - 1
         rows = self._row_of[ids >> COMMAND_BITS & 0x3F].copy()
-        rows[~np.isin(commands, ANSWERS) | (frames["length"] != 8) | (ids & (EXTENDED | REMOTE | ERROR) != 0)] = -1
+        short = (frames["length"] != 8) & ~((commands == Command.ADDRESS) & (frames["length"] == 7))
+        rows[~np.isin(commands, ANSWERS) | short | (ids & (EXTENDED | REMOTE | ERROR) != 0)] = -1
         return rows, commands
 
     def error_name(self, code: int) -> str:
@@ -306,6 +338,8 @@ class OdriveCodec:
 
 
 ANSWERS = [
+    Command.GET_VERSION,
+    Command.ADDRESS,
     Command.HEARTBEAT,
     Command.GET_MOTOR_ERROR,
     Command.GET_ENCODER_ERROR,
@@ -342,6 +376,16 @@ class OdriveMotors:
         return make_frames(
             np.array([identifier(self.nodes[row], Command.HEARTBEAT)]), data.view(np.uint8).reshape(1, 8)
         )
+
+    def pack_version(self, row: int, version: int) -> np.ndarray:
+        """FRAME (1,) of a firmware ``version`` (a byte each of major, minor, revision)."""
+        data = np.frombuffer(bytes([2, 4, 4, 58]) + version.to_bytes(3, "big") + b"\0", np.uint8)
+        return make_frames(np.array([identifier(self.nodes[row], Command.GET_VERSION)]), data[None])
+
+    def pack_address(self, row: int, serial: int) -> np.ndarray:
+        """FRAME (1,) of a serial number of 48 bits."""
+        data = np.frombuffer(bytes([self.nodes[row]]) + serial.to_bytes(6, "little") + b"\0", np.uint8)
+        return make_frames(np.array([identifier(self.nodes[row], Command.ADDRESS)]), data[None])
 
     def pack_estimates(self, row: int, position: float, velocity: float) -> np.ndarray:
         """FRAME (1,) of a joint's rad and rad/s."""

@@ -18,7 +18,7 @@ An SDO parameter is a byte offset into the firmware's memory, with an upper boun
 what the motor runs on. No offset leaves here but those in PARAMETERS.
 
 Sources: firmware T-K-233/Recoil-Motor-Controller-BESC (function codes, parameters, modes, errors, position controller) and
-the host's side HybridRobotics/Berkeley-Humanoid-Lite-Lowlevel (lengths of the frames), whose error enumeration
+the host's side HybridRobotics/Berkeley-Humanoid-Lite-Lowlevel (lengths of the frames, FLUX_OFFSET), whose error enumeration
 disagrees with the firmware's from bit 10 on; the firmware's is used.
 """
 
@@ -117,6 +117,7 @@ PARAMETERS: dict[str, tuple[int, str, bool]] = {
     "CURRENT_LIMIT": (0x074, "<f4", True),  # A
     "BUS_VOLTAGE": (0x100, "<f4", False),  # V
     "ENCODER_CPR": (0x120, "<i4", False),
+    "FLUX_OFFSET": (0x13C, "<f4", False),  # rad, as its own calibration measured it: no two motors have the same
 }
 PARAMETER_NAMES = {offset: name for name, (offset, _, _) in PARAMETERS.items()}
 MONITORED = ("MODE", "ERROR", "MODE", "TORQUE_MEASURED")  # asked in turn
@@ -207,7 +208,7 @@ class RecoilCodec:
     # gains of every motor in each.
     TICK_BITS = (120.5 + 115.1 + (77.0 + 84.0) / 3, 135.0 + 135.0 + (85.0 + 95.0) / 3 + 2 * 135.0)
     TICK_OVERHEAD_BITS = 120.0
-    IDENTITY = ()
+    IDENTITY = ("FIRMWARE_VERSION", "FLUX_OFFSET")  # there is no serial number
     TURN = 0.0  # the count of the motor's own turns is lost, and with it the joint's zero
     MOTOR_FRAMES = 2 + 2 / 3
 

@@ -35,6 +35,9 @@ class ImuParser(Protocol):
         """Every ImuPacket completed by ``data``, oldest first."""
         ...
 
+    # One whose sensor must be told to send also has:
+    # def ask(self, now: float, rate: float) -> bytes: what to write to it now, for packets at ``rate`` Hz.
+
 
 class SerialImu:
     """An IMU on a serial wire (a ``drivers.bus.Imu``)."""
@@ -46,12 +49,15 @@ class SerialImu:
         self._wire = wire
         self._state = ImuState.empty()
         self._implausible = 0
+        self._ask = getattr(parser, "ask", None)
 
     def read(self, now: float) -> ImuState:
         """A packet that is not finite, or whose quaternion is not of length 1, is rejected and leaves the state old.
         Raises BusError if the port is gone."""
         try:
             data = self._wire.read()
+            if self._ask is not None and (asked := self._ask(now, self.spec.rate)):
+                self._wire.write(asked)
         except WireError as error:
             raise BusError(f"imu {self.spec.protocol} ({self.spec.channel}): {error}") from error
         packets = self._parser.feed(data)

@@ -166,6 +166,9 @@ class StatePublisher:
         self._scale = np.repeat([noise.orientation / 2, noise.angular_velocity, noise.acceleration], 3)
         self._mean = np.concatenate([np.zeros(3), noise.angular_velocity_bias, noise.acceleration_bias])
 
+    def hear(self, data: bytes, now: float) -> None:
+        """Nobody tells it anything."""
+
     def sample(self, now: float) -> None:
         """Publish what is due by ``now``."""
         if now + TOLERANCE < (self._samples + 1) * self._period:

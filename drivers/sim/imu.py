@@ -27,14 +27,14 @@ BLOCK = 256  # samples of noise drawn at once
 
 
 class Sensor(Protocol):
-    """A sensor's side of its protocol."""
+    """A sensor's side of its protocol. One that listens to its host has ``hear(data: bytes) -> bytes``: what it answers."""
 
     RATE_MAX: float  # Hz
 
     def pack(
         self, time: float, orientation: Sequence[float], spin: Sequence[float], acceleration: Sequence[float]
     ) -> bytes:
-        """A sample as it is sent: s, (4,) w, x, y, z, (3,) rad/s and (3,) m/s^2 in the sensor's own frame."""
+        """A sample as it is sent: s, (4,) w, x, y, z, (3,) rad/s and (3,) m/s^2 in the sensor's own frame. b"": nothing is."""
         ...
 
     def retell(self, packet: bytes, change: Callable[[bytearray], None]) -> bytes:
@@ -107,7 +107,14 @@ class SimImu:
         )
         self._send(packet, now)
 
+    def hear(self, data: bytes, now: float) -> None:
+        """What the host writes."""
+        if (hear := getattr(self._sensor, "hear", None)) is not None:
+            self._send(hear(data), now)
+
     def _send(self, packet: bytes, now: float) -> None:
+        if not packet:
+            return
         copies, start = 1, now
         for fault in self._faults:
             if not fault.start <= now < fault.end or self._random.random() >= fault.probability:
@@ -137,7 +144,8 @@ class SimImu:
 
         if kind != "corrupt":
             return self._sensor.retell(packet, change)
-        spoiled, at = bytearray(packet), self._random.randrange(64, 8 * len(packet))
+        spoiled = bytearray(packet)
+        at = self._random.randrange(min(64, 4 * len(packet)), 8 * len(packet))
         spoiled[at // 8] ^= 1 << at % 8  # the check no longer fits
         return bytes(spoiled)
 
@@ -169,13 +177,14 @@ class SimImu:
 
 
 class SimSerialWire:
-    """The host's end of the IMU's line: a drivers.wire.SerialWire. What the host writes is ignored."""
+    """The host's end of the IMU's line: a drivers.wire.SerialWire. Most sensors ignore what the host writes."""
 
     def __init__(self, imu: SimImu, now: Callable[[], float]):
         self._imu, self._now, self._open = imu, now, True
 
     def write(self, data: bytes) -> None:
         self._check()
+        self._imu.hear(data, self._now())
 
     def read(self) -> bytes:
         self._check()

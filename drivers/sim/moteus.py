@@ -5,7 +5,8 @@ What they copy from the firmware: a frame is answered with the state before it i
 controller obey; faults and the time-out stay until a stop; the target moves on with its velocity until the next command;
 kp and kd scale separately; a start outside servopos.position_min and max is a fault; configuration lives in RAM, from where
 ``conf write`` takes it to flash. After a time-out the controller does what servo.timeout_mode says, here 0 (limp), 10 and 12
-(damping with its kd) or 15 (phases shorted: SHORTED_DAMPING). A power cycle loses the turns of the rotor.
+(damping with its kd) or 15 (phases shorted: SHORTED_DAMPING). A power cycle loses the turns of the rotor, or of the output
+where an encoder is configured there.
 
 Not modelled: the 8 ms that it takes to get ready (modes 2 to 4), trajectories (velocity and acceleration limits), integral
 gain, stop position, other modes than 0, 10, 12 and 15, flow control of the console, telemetry, slip and error faults.
@@ -20,7 +21,7 @@ import numpy as np
 
 from drivers.bus import BusSpec, MotorCommand
 from drivers.codecs import moteus
-from drivers.codecs.moteus import TURN, Mode, MoteusMotors
+from drivers.codecs.moteus import TURN, HomeState, Mode, MoteusMotors
 from drivers.codecs.moteus_frame import (
     CONSOLE,
     CONSOLE_READ,
@@ -61,6 +62,9 @@ FACTORY = {  # fw/bldc_servo_structs.h; the ratio and max_current's N m are the 
     "servo.timeout_mode": float(Mode.ZERO_VELOCITY),
     "servo.default_velocity_limit": np.nan,
     "servo.default_accel_limit": np.nan,
+    "motor_position.output.source": 0.0,
+    "motor_position.output.reference_source": -1.0,  # that only says in which turn of the rotor it starts; -1: none
+    **{f"motor_position.sources.{i}.reference": 0.0 for i in range(3)},  # 1: this encoder measures the output
     "servopos.position_min": np.nan,
     "servopos.position_max": np.nan,
 }
@@ -85,6 +89,7 @@ class SimMoteus(SimMotors):
         self.mode = [Mode.STOPPED] * n
         self._command = np.zeros((6, n))
         self._came = np.zeros(n)  # s, when it did
+        self._set = [False] * n  # its position was set since power-on
         self._now = 0.0
         self._typed, self._says = [b""] * n, [b""] * n  # consoles: a line not yet whole, what is not yet fetched
         super().__init__(buses, body, frame_bits, **options)
@@ -122,6 +127,9 @@ class SimMoteus(SimMotors):
             answer = self._say(row, self._codec.pack(row, id >> 8 & 0x7F, reply[:PAYLOAD_MAX]))
         if Register.MODE in written:
             self._act_on(row, written, time)
+        for register, unit in ((Register.SET_OUTPUT_NEAREST, self._rotor_turn(row)), (Register.SET_OUTPUT_EXACT, 0.0)):
+            if np.isfinite(wanted := written.get(register, np.nan)):
+                self._set_output(row, wanted * TURN, unit)
         return answer
 
     def _reply(self, row: int, s: Subframe, time: float) -> bytes:
@@ -158,7 +166,7 @@ class SimMoteus(SimMotors):
             Register.POWER: torque * float(self._body.joint_vel[row]),
             Register.MOTOR_TEMPERATURE: float(self.rotor_temperature[row]),
             Register.TRAJECTORY_COMPLETE: 1,
-            Register.HOME_STATE: 1,
+            Register.HOME_STATE: self._home_state(row),
             Register.VOLTAGE: BUS_VOLTAGE,
             Register.TEMPERATURE: float(self.driver_temperature[row]),
             Register.FAULT: int(self.error[row]),
@@ -295,8 +303,25 @@ class SimMoteus(SimMotors):
         super().power(row, on, time)
 
     def _boot(self, row: int) -> None:
-        turn = TURN * self._registers[row]["motor_position.rotor_to_output_ratio"]
+        self._set[row] = False
+        turn = TURN if self._home_state(row) == HomeState.OUTPUT else self._rotor_turn(row)
         self.zero[row] += turn * np.round(self.position[row] / turn)
+
+    def _rotor_turn(self, row: int) -> float:
+        """rad of the output."""
+        return TURN * self._registers[row]["motor_position.rotor_to_output_ratio"]
+
+    def _home_state(self, row: int) -> HomeState:
+        held = self._registers[row]
+        sources = held["motor_position.output.source"], held["motor_position.output.reference_source"]
+        encoder = any(held.get(f"motor_position.sources.{s:.0f}.reference") == 1.0 for s in sources)
+        return HomeState.OUTPUT if encoder or self._set[row] else HomeState.ROTOR
+
+    def _set_output(self, row: int, wanted: float, unit: float) -> None:
+        """The position (rad) is what is ``wanted``, up to multiples of ``unit``; 0: just so."""
+        shift = float(self.position[row]) - wanted
+        self.zero[row] += unit * np.round(shift / unit) if unit else shift
+        self._set[row] = self._stale = self._changed = True
 
     def _peak(self) -> np.ndarray:
         return np.array([m.torque for m in self._codec.models])

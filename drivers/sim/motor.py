@@ -95,6 +95,9 @@ class SimMotors:
         self.bus_names = [b.name for b in buses for _ in b.motors]
         self._bus_specs = list(buses)
         self._bitrates = [b.bitrate for b in buses]  # at which the hosts talk now
+        self.deaf: list[dict[int, int]] = [
+            {} for _ in buses
+        ]  # by bus, who has power and another bit rate: {row: bit/s}
         n = len(self.specs)
         self._body, self._frame_bits, self._wrap = body, frame_bits, wrap
         self._bus_of = np.repeat(np.arange(len(buses)), [len(b.motors) for b in buses])
@@ -318,6 +321,10 @@ class SimMotors:
         self._all = replace(self._all, motors=self.specs)
         hears = [self.powered[row] and rate == self._bitrates[bus]
                  for row, (bus, rate) in enumerate(zip(self._bus_of.tolist(), bitrates, strict=True))]  # fmt: skip
+        self.deaf = [{} for _ in self._bus_specs]
+        for row, (bus, rate) in enumerate(zip(self._bus_of.tolist(), bitrates, strict=True)):
+            if self.powered[row] and not hears[row]:
+                self.deaf[bus][row] = rate
         self._rows = [
             {self.specs[row].id: row for row in range(first, first + len(b.motors)) if hears[row]}
             for first, b in zip(self._first, self._bus_specs, strict=True)

@@ -1,4 +1,4 @@
-"""Emulated ODrive axes with CANSimple, firmware 0.5.x.
+"""Emulated ODrive axes with CANSimple, firmware 0.5.x; with another FIRMWARE, such that tells its version and address.
 
 An axis starts at idle, takes its own position for its target when it enters closed loop, and says by heartbeats, unasked,
 what state it is in. Every frame to its node feeds the watchdog, questions too; on expiry it goes idle, free of torque, with an
@@ -25,6 +25,7 @@ from drivers.wire import ERROR, EXTENDED, FRAME, REMOTE
 FACTORY = {
     "WATCHDOG_TIMEOUT": 0.0,  # s; 0: off
     "HEARTBEAT_RATE_MS": 10.0,
+    "FIRMWARE": 0x000506,  # a byte each of major, minor, revision
     "VEL_LIMIT": 2.0,  # rev/s
     "CURRENT_LIMIT": 10.0,  # A
     "CONTROL_MODE": float(odrive.POSITION_CONTROL),
@@ -32,6 +33,9 @@ FACTORY = {
     "POS_GAIN": 20.0,  # 1/s
     "VEL_GAIN": 1 / 6,  # N m s/rev
 }
+
+
+FIRST_SERIAL = 0x3943_3254_3230  # of the first axis; then they count up
 
 
 class SimOdrive(SimMotors):
@@ -47,6 +51,7 @@ class SimOdrive(SimMotors):
         super().__init__(buses, body, frame_bits, **options)
         # The axes were not switched on at the same instant.
         self._beat_due = [0.001 * (row + 1) for row in range(len(self.specs))]
+        self._address_due = [np.inf] * len(self.specs)
 
     def factory(self) -> list[dict[str, float]]:
         return [dict(FACTORY) for _ in self.specs]
@@ -55,6 +60,11 @@ class SimOdrive(SimMotors):
         return -1 if id & (EXTENDED | ERROR) else self._rows[bus].get((id & ~REMOTE) >> odrive.COMMAND_BITS, -1)
 
     def receive(self, bus: int, id: int, raw: bytes, time: float) -> Answer | None:
+        if id == REMOTE | odrive.identifier(odrive.BROADCAST, Command.ADDRESS):
+            for other in range(len(self.specs)):  # one after the other, lest they collide
+                if self._bus_of[other] == bus and self._modern(other):
+                    self._address_due[other] = time + 0.001 * (other + 1)
+            return None
         row = self.addressee(bus, id, raw)
         if row < 0 or not self.powered[row]:
             return None
@@ -94,12 +104,20 @@ class SimOdrive(SimMotors):
             answer = self._codec.pack_estimates(row, self.position[row], sign * self._body.joint_vel[row])
         elif command == Command.GET_IQ:
             answer = self._codec.pack_current(row, sign * self._body.joint_torque[row])
+        elif command == Command.GET_VERSION and self._modern(row):
+            answer = self._codec.pack_version(row, int(self._registers[row]["FIRMWARE"]))
         else:
             return None
         return self._say(row, answer)
 
     def unasked(self, start: float, end: float) -> list[tuple[int, float, Answer]]:
         beats = []
+        for row, due in enumerate(self._address_due):
+            if due < end:
+                self._address_due[row] = np.inf
+                if self.powered[row]:
+                    frame = self._codec.pack_address(row, FIRST_SERIAL + row)
+                    beats.append((int(self._bus_of[row]), max(start, due), self._say(row, frame)))
         for row, due in enumerate(self._beat_due):
             if due < end:
                 period = self._registers[row]["HEARTBEAT_RATE_MS"] * 1e-3
@@ -109,6 +127,9 @@ class SimOdrive(SimMotors):
                     beat = self._codec.pack_heartbeat(row, int(self.error[row]), state)
                     beats.append((int(self._bus_of[row]), max(start, due), self._say(row, beat)))
         return beats
+
+    def _modern(self, row: int) -> bool:
+        return int(self._registers[row]["FIRMWARE"]) >> 8 >= odrive.MODERN[0] << 8 | odrive.MODERN[1]
 
     def _set(self, row: int, **values: float) -> None:
         if np.isfinite(list(values.values())).all():

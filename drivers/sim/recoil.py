@@ -66,8 +66,9 @@ class SimRecoil(SimMotors):
                 "POSITION_LIMIT_LOWER": -np.inf,
                 "POSITION_LIMIT_UPPER": np.inf,
                 "TORQUE_FILTER_ALPHA": 0.145,
+                "FLUX_OFFSET": round(2.399 * row % 6.283 + 0.1, 3),
             }
-            for m in self.specs
+            for row, m in enumerate(self.specs)
         ]
 
     def addressee(self, bus: int, id: int, raw: bytes) -> int:

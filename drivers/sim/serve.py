@@ -202,8 +202,8 @@ class Server:
             else:
                 self._hear(sock)
         for name, bridge in self._bridges.items():
-            if (data := bridge.hear()) and name in self._ports:
-                self._ports[name].hear(data, self._now())
+            if data := bridge.hear():
+                (self.world.imu if name == "imu" else self._ports[name]).hear(data, self._now())
 
     def _follow(self, real: float, began: float) -> None:
         """Move the world on to real time, as far as it can follow."""
@@ -234,7 +234,9 @@ class Server:
             sock.close()
         elif name == "world":
             self._send(sock, self._call(data))
-        elif name != "imu" and (answer := self._ports[name].hear(data, self._now())):
+        elif name == "imu":
+            self.world.imu.hear(data, self._now())
+        elif answer := self._ports[name].hear(data, self._now()):
             self._send(sock, answer)
 
     def _now(self) -> float:

@@ -4,7 +4,11 @@ The host is a controller with one FIFO (so that its later, more urgent frames wa
 node of its own that answers ``reply_delay`` after a frame has ended. An adapter adds ``latency`` either way. A frame
 that nobody on the bus acknowledges is sent again for ever, as real controllers do: then the queue fills up.
 
-Not modelled: error-passive nodes, overload frames, two nodes sending one identifier at once, clock tolerance, an error in
+A motor at another bit rate takes every frame for an error and breaks it off, until it is error-passive and says no more. By
+then the host's controller is error-passive too, or has left the bus: the slower the stranger, the longer its error flags.
+The host hears of its controller what Linux tells: error-passive, bus-off, restarted.
+
+Not modelled: other error-passive nodes, how counters fall again after errors other than those, overload frames, two nodes sending one identifier at once, clock tolerance, an error in
 the middle of a CAN-FD payload (it breaks the frame off at its end).
 """
 
@@ -14,7 +18,7 @@ import hashlib
 import random
 from bisect import insort
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
 from typing import Protocol
@@ -23,9 +27,22 @@ import numpy as np
 
 from drivers.bus import BusSpec
 from drivers.sim.faults import FEEDBACK, HOST, POWER, Fault
-from drivers.wire import EXTENDED, FRAME, WireError, WireFull, frame_type
+from drivers.wire import (
+    BUS_OFF,
+    CONTROLLER,
+    ERROR,
+    ERROR_PASSIVE,
+    EXTENDED,
+    FRAME,
+    RESTARTED,
+    WireError,
+    WireFull,
+    frame_type,
+)
 
 ERROR_FRAME_BITS = 20  # error flag (6), its superposition (up to 6), delimiter (8), as good as always
+PASSIVE_COUNT = 128  # ISO 11898-1: error counter at which a node only sends error flags that disturb nobody
+FLAG_BITS = 6  # of an active error flag
 BUS_OFF_COUNT = 256  # ISO 11898-1: transmit error counter at which a controller leaves the bus
 BUS_OFF_TRIES = BUS_OFF_COUNT // 8  # failures in a row that take it there; a motor's answer is lost then
 RESTART = 0.1  # s: how long the host then stays away (restart-ms 100, the usual setting)
@@ -37,6 +54,7 @@ class Motors(Protocol):
     """What a wire asks of the motors on it. ``row``: a motor's index over all buses."""
 
     powered: list[bool]
+    deaf: list[dict[int, int]]  # by bus, who has power and listens at another bit rate than its host: {row: bit/s}
 
     def retune(self, bus: int, bitrate: int) -> None:
         """The host of a bus now talks at ``bitrate``."""
@@ -100,6 +118,9 @@ class SimCan:
         self._free = 0.0  # when the wire is idle again
         self._order = 0
         self._errors = 0  # the host's transmit error counter
+        self._passive = False  # the host was told that its controller is error-passive
+        self._strain = 8  # what the last frame that was broken off added to it
+        self._upset: dict[int, int] = {}  # receive error counters of motors at another bit rate
         self._away_until = -1.0
         self._faults: list[tuple[Fault, frozenset[int]]] = []
         self._host_faults: list[Fault] = []
@@ -143,6 +164,8 @@ class SimCan:
         self._queue.clear()
         self.sent.clear()
         self._bit = 1.0 / bitrate
+        self._errors, self._passive = 0, False
+        self._upset.clear()
         self._motors.retune(self.index, bitrate)
 
     # -- the wire ----------------------------------------------------------------------------------------------------
@@ -174,7 +197,8 @@ class SimCan:
         queue, waiting, contending, powered = self._queue, self._waiting, self._contending, self._motors.powered
         receive, bus, delay, bit = self._motors.receive, self.index, self._reply_delay, self._bit
         faults = [f for f in self._faults if f[0].start < until and f[0].end > self._free] if self._faults else ()
-        if (self._host_faults or self._away_until > self._free or not all(powered)) and self._stalls(until):
+        deaf = self._motors.deaf[bus]
+        if (self._host_faults or self._away_until > self._free or deaf or not all(powered)) and self._stalls(until):
             return
         traffic, carried, inbox, latency = self.traffic, self.carried, self.inbox, self._latency
         while True:
@@ -196,6 +220,10 @@ class SimCan:
                 if end > until:
                     return
                 queue.popleft()
+                if deaf and self._jammed(deaf, start, bits):
+                    if not self._fails(start):
+                        queue.appendleft((self._free, priority(id), id, raw, bits, tries))
+                    continue
                 copies = self._spoil_command(faults, start, id, raw, bits, tries) if faults else 1
                 if copies is None:
                     continue
@@ -205,6 +233,8 @@ class SimCan:
                 carried.append(raw)
                 if self._errors:
                     self._errors -= 1
+                    if self._passive and self._errors < PASSIVE_COUNT:
+                        self._passive = False
                 for _ in range(copies):
                     answer = receive(bus, id, raw, end)
                     if answer is not None:
@@ -222,6 +252,10 @@ class SimCan:
                     return
                 key, order, raw, bits, row, tries = heappop(contending)
                 if not powered[row]:
+                    continue
+                if deaf and self._jammed(deaf, start, bits):
+                    if tries < BUS_OFF_TRIES:
+                        insort(waiting, (self._free, key, order, raw, bits, row, tries + 1))
                     continue
                 copies = 1
                 if faults:
@@ -247,14 +281,67 @@ class SimCan:
         start = self._free if self._contending else max(self._free, first)
         if self.away(start):
             queue.clear()
-        elif queue and not any(self._motors.powered[row] for row in self.rows.values()):
+        elif queue and not self._acknowledged():
             self.traffic.busy += max(0.0, until - max(start, queue[0][0]))
+            self._errors = max(
+                self._errors, PASSIVE_COUNT
+            )  # no further: nobody there is no fault of its own (ISO 11898-1)
+            self._tell(start)
         else:
             return False
         waiting.clear()
         self._contending.clear()
         self._free = max(self._free, until)
         return True
+
+    def _acknowledged(self) -> bool:
+        """Whether anybody takes the host's frames, or at least breaks them off."""
+        deaf = self._motors.deaf[self.index]
+        return any(
+            self._motors.powered[row] and (row not in deaf or self._upset.get(row, 0) < PASSIVE_COUNT)
+            for row in self.rows.values()
+        )
+
+    # -- motors at another bit rate ------------------------------------------------------------------------------------
+
+    def _jammed(self, deaf: Mapping[int, int], start: float, bits: int) -> bool:
+        """Whether one of them breaks a frame off that begins at ``start``; all that hear it count it."""
+        angry = [row for row in deaf if self._upset.get(row, 0) < PASSIVE_COUNT]
+        if not angry:
+            return False
+        self._break_off(start, bits)
+        for row in angry:
+            longer = max(1.0, deaf[row] * self._bit)  # the others' flags, in its own bits
+            self._upset[row] = self._upset.get(row, 0) + 8 * (1 + int(FLAG_BITS * (longer - 1) // 8))
+        slowest = max(1.0, 1 / (self._bit * min(deaf[row] for row in angry)))
+        self._strain = 8 * (1 + int(FLAG_BITS * (slowest - 1) // 8))  # and eight more for every eight bits of dominance
+        return True
+
+    def _fails(self, start: float) -> bool:
+        """The host's frame was broken off: count it. Returns whether its controller left the bus, and forgot what it had."""
+        self._errors += self._strain
+        if off := self._errors >= BUS_OFF_COUNT:
+            self._errors = 0
+            self.traffic.bus_off += 1
+            self._away_until = start + RESTART
+            self._queue.clear()
+            self._passive = False
+            self._say_error(start, BUS_OFF)
+            self._say_error(self._away_until, RESTARTED)
+        self._tell(start)
+        return off
+
+    def _tell(self, start: float) -> None:
+        """The host learns when its controller becomes error-passive."""
+        if self._errors >= PASSIVE_COUNT and not self._passive:
+            self._passive = True
+            self._say_error(start, CONTROLLER, ERROR_PASSIVE & 0x20)
+
+    def _say_error(self, time: float, what: int, how: int = 0) -> None:
+        frame = np.zeros(1, self.frame)
+        frame["id"], frame["length"] = ERROR | what, 8
+        frame["data"][0, 1] = how
+        self.inbox.append((time + self._latency, frame.tobytes()))
 
     # -- faults ------------------------------------------------------------------------------------------------------
 
@@ -289,13 +376,8 @@ class SimCan:
                 return None
             elif fault.kind == "corrupt":
                 self._break_off(start, bits)
-                self._errors += 8
-                if self._errors >= BUS_OFF_COUNT:
-                    self._errors = 0
-                    self.traffic.bus_off += 1
-                    self._away_until = start + RESTART
-                    self._queue.clear()
-                else:
+                self._strain = 8
+                if not self._fails(start):
                     self._queue.appendleft((self._free, priority(id), id, raw, bits, tries))
                 return None
         return copies
@@ -339,6 +421,7 @@ class SimCan:
 
     def forget(self, row: int) -> None:
         """A motor lost its power: what it wanted to say is gone."""
+        self._upset.pop(row, None)
         self._waiting = deque(w for w in self._waiting if w[5] != row)
         self._contending = [c for c in self._contending if c[4] != row]
         heapify(self._contending)

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.bus import Clock
-from drivers.open import PROTOCOLS, load
 from sim2real.calibration import MotorCalibration
 from sim2real.config import RobotConfig, Wiring
+from sim2real.preflight import UNREFERENCED, anonymous
 from sim2real.records import layout, state_fields, state_view
 from sim2real.robot import Robot
 from sim2real.types import RobotState, Sim2realError
@@ -50,9 +50,14 @@ class Motors:
         self.turn: dict[str, float] = {}
         self.fingerprint: dict[str, str] = {}
         self.place: dict[str, tuple[str, int]] = {}  # bus and id
+        self.warnings: list[str] = []  # of buses whose motors tell no serial number
         for bus in robot.buses:
-            turn = load(PROTOCOLS[bus.spec.protocol].codec).TURN
-            for motor, fingerprint in zip(bus.spec.motors, bus.fingerprints(), strict=True):
+            fingerprints = bus.fingerprints()
+            if warning := anonymous(bus, fingerprints):
+                self.warnings.append(warning)
+            for motor, fingerprint, turn in zip(bus.spec.motors, fingerprints, bus.turns(), strict=True):
+                if np.isnan(turn):
+                    raise Sim2realError(f"{motor.joint}: {UNREFERENCED}")
                 self.turn[motor.joint], self.fingerprint[motor.joint] = turn, fingerprint
                 self.place[motor.joint] = bus.spec.name, motor.id
 
@@ -236,7 +241,8 @@ def checks(
         ):
             yield (
                 f"{config.joint_names[left]} hangs at {q[left]:.2f} rad and {config.joint_names[right]} at {q[right]:.2f}, "
-                f"expected {'the same' if sign > 0 else 'opposites'} within {SYMMETRY:g}"
+                f"expected {'the same' if sign > 0 else 'opposites'} within {SYMMETRY:g}. Did one of them come down the other "
+                "way round (three axes reach every place twice)? Lay both down alike and start again: what is measured is kept"
             )
 
 

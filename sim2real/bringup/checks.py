@@ -219,7 +219,10 @@ def can_buses(q: Question) -> Iterator[Finding]:
             why = f"the wiring says {spec.bitrate}: at another rate every frame is an error"
             problems.append((Level.FAIL, f"bit rate {bitrate}", why, again))
         if state in ("BUS-OFF", "ERROR-PASSIVE"):
-            why = "nobody acknowledges: check motor power, wiring, termination and the motors' bit rate"
+            why = (
+                "nobody acknowledges, or a motor at another bit rate breaks every frame off: check motor power, wiring and "
+                f"termination, and `sim2real scan --channel {name} --protocol {spec.protocol}` at {spec.bitrate} and others"
+            )
             problems.append((Level.FAIL, state, why, again))
         if details and not CAN_RESTART[0] <= restart <= CAN_RESTART[1]:
             why = "after bus-off the interface would stay dead until somebody restarts it"

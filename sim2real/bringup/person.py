@@ -1,7 +1,9 @@
 """A simulated person who calibrates a simulated robot: hands on its joints, eyes on its body, no idea of its motors.
 
 One hand moves a joint; the other holds the rest of the limb in the middle of its ranges, out of the way, and
-somewhere else where the joint still runs into something before its stop.
+somewhere else where the joint still runs into something before its stop. Afterwards both lay the limb back where it was
+found: three axes of a hip have two sets of angles for a leg that hangs straight down, so a leg that is dropped from its stops
+may come down by the other one.
 """
 
 from __future__ import annotations
@@ -33,7 +35,9 @@ class Person:
     ) -> None:  # fmt: skip
         self._world, self._ranges, self._limbs, self._timestep = world, ranges, limbs, timestep
         self._reach = reach or {}
-        self._joint = ""
+        self._found = dict(zip(world.plant.joints, world.plant.joint_pos.tolist(), strict=True))
+        self._joint = self._next = ""
+        self._laying_down = False
         self._held: dict[str, float] = {}  # where the other hand has the rest of the limb
         self._target = 0.0
         self._goals: list[tuple[float, float]] = []  # (where to, how long to stay there)
@@ -42,27 +46,42 @@ class Person:
         self._random = np.random.default_rng(0)
 
     def move(self, joint: str) -> None:
-        """From now on: from its middle to its lower stop, then to its upper one, and stay there; or twice to the only one there is."""
+        """As soon as the limb in hand is laid down: from its middle to its lower stop, then to its upper one, and stay there;
+        or twice to the only one there is."""
         self.let_go()
-        low, high = self._ranges[joint]
-        plant = self._world.plant
-        self._joint, self._target = joint, float(plant.joint_pos[plant.joints.index(joint)])
-        self._held = {
-            other: float(plant.joint_pos[plant.joints.index(other)])
-            for other, limb in self._limbs.items() if limb == self._limbs[joint] and other != joint
-        }  # fmt: skip
+        self._next = joint
+        if not self._joint:
+            self._take()
+
+    def let_go(self) -> None:
+        """Lay the limb down, and hands off."""
+        self._next = ""
+        if self._joint and not self._laying_down:
+            self._laying_down, self._stayed, self._blocked = True, 0.0, 0.0
+            self._goals = [(self._found[self._joint], 0.0)]
+            self._posture = {other: self._found[other] for other in self._held}
+
+    def _take(self) -> None:
+        """The next joint in hand."""
+        self._joint, self._next = self._next, ""
+        low, high = self._ranges[self._joint]
+        self._target = self._at(self._joint)
+        limb = [other for other, limb in self._limbs.items() if limb == self._limbs[self._joint]]
+        self._held = {other: self._at(other) for other in limb if other != self._joint}
         self._posture = {other: sum(self._ranges[other]) / 2 for other in self._held}
-        if (reach := self._reach.get(joint, "both")) == "both":
+        if (reach := self._reach.get(self._joint, "both")) == "both":
             self._goals = [((low + high) / 2, 0.0), (low - BEYOND, HOLD_TIME), (high + BEYOND, np.inf)]
         else:
             stop, back = (high + BEYOND, high - BACK) if reach == "upper" else (low - BEYOND, low + BACK)
             self._goals = [(back, 0.0), (stop, HOLD_TIME), (back, 0.0), (stop, np.inf)]
 
-    def let_go(self) -> None:
-        """Hands off."""
-        for joint in (self._joint, *self._held) if self._joint else ():
+    def _release(self) -> None:
+        """Hands off, and on to the next joint where there is one."""
+        for joint in (self._joint, *self._held):
             self._world.plant.pull(joint, 0.0)
-        self._joint, self._held, self._stayed, self._blocked = "", {}, 0.0, 0.0
+        self._joint, self._laying_down, self._held, self._stayed, self._blocked = "", False, {}, 0.0, 0.0
+        if self._next:
+            self._take()
 
     def advance(self, until: float) -> None:
         """Let time pass in the world, and hands do what they do."""
@@ -79,7 +98,11 @@ class Person:
             self._held[joint] += self._grip(joint, target, self._posture[joint], dt)
         there = abs(self._at(self._joint) - goal) < 2 * BEYOND
         self._blocked = 0.0 if there or step else self._blocked + dt
-        if self._blocked > PATIENCE and self._held:
+        if self._laying_down:
+            self._stayed += dt if there and not step else 0.0
+            if self._stayed > stay or self._blocked > PATIENCE:
+                self._release()
+        elif self._blocked > PATIENCE and self._held:
             self._blocked = 0.0
             self._posture = {joint: 0.8 * float(self._random.uniform(*self._ranges[joint])) for joint in self._held}
             self._goals.insert(0, (sum(self._ranges[self._joint]) / 2, 0.5))

@@ -17,9 +17,10 @@ import numpy as np
 from drivers.bus import BusSpec, Clock, MotorSpec
 from drivers.codecs import damiao
 from drivers.codecs.damiao import Operation
-from drivers.wire import ERROR, CanWire, WireFull, make_frames
+from drivers.wire import BUS_OFF, CONTROLLER, ERROR, ERROR_PASSIVE, CanWire, WireError, WireFull, WireGone, make_frames
 
 ANSWER_TIME = 0.01  # s for the answers to one batch of questions
+RESTART_TIME = 0.15  # s until a controller is back on the bus: restart-ms 100, and some
 POLL_PERIOD = 0.001  # s between two looks at the wire
 BATCH = 16  # identifiers asked at once: what fits into a default queue twice over would not
 TRIES = 3
@@ -47,6 +48,7 @@ class Sweep:
 
     motors: list[Found]
     error_frames: int = 0  # or, on a serial line, packets that were garbled
+    controller: str = ""  # the worst that the CAN controller said of itself: "error-passive", "bus-off"; "": nothing
     protocol: str = "damiao"
 
 
@@ -117,16 +119,29 @@ def _converse(
 def converse(wire: CanWire, clock: Clock, frames: np.ndarray, swept: Sweep, time: float = ANSWER_TIME) -> Iterator[Any]:
     """Send ``frames``; each FRAME that comes back within ``time`` s. Error frames are counted. Raises WireError.
 
-    A queue that is full is a bus on which nobody acknowledges: nobody answers either.
+    A queue that is full is a bus on which nobody acknowledges: nobody answers either. A controller that has left the bus is
+    waited for.
     """
-    with suppress(WireFull):
-        wire.send(frames)
+    try:
+        with suppress(WireFull):
+            wire.send(frames)
+    except WireGone:
+        raise
+    except WireError:
+        swept.controller = "bus-off"
+        clock.sleep_until(clock.now() + RESTART_TIME)
+        with suppress(WireFull):
+            wire.send(frames)
     start = clock.now()
     for n in range(round(time / POLL_PERIOD)):
         clock.sleep_until(start + (n + 1) * POLL_PERIOD)
         for frame in wire.recv():
             if frame["id"] & ERROR:
                 swept.error_frames += 1
+                if frame["id"] & BUS_OFF:
+                    swept.controller = "bus-off"
+                elif frame["id"] & CONTROLLER and frame["data"][1] & ERROR_PASSIVE and not swept.controller:
+                    swept.controller = "error-passive"
             else:
                 yield frame
 

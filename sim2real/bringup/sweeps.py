@@ -132,8 +132,16 @@ def sweep_odrive(wire: CanWire, clock: Clock, ids: Iterable[int] = range(odrive.
         elif command == odrive.Command.HEARTBEAT:
             beats[id] = np.frombuffer(frame["data"].tobytes(), odrive.HEARTBEAT)[0]
 
+    def version(id: int) -> np.ndarray:  # to which firmware 0.5 is silent
+        return make_frames(np.array([REMOTE | odrive.identifier(id, odrive.Command.GET_VERSION)]), NO_DATA, length=0)
+
     for n, frame in _ask_all(wire, clock, ids, swept, question):
         hear(frame, n)
+    for _, frame in _ask_all(wire, clock, list(found), swept, version):
+        hear(frame, TRIES)
+        id, command = divmod(int(frame["id"]), 1 << odrive.COMMAND_BITS)
+        if command == odrive.Command.GET_VERSION and id in found and frame["length"] == 8:
+            found[id].firmware = ".".join(map(str, frame["data"][4:7].tolist()))
     for frame in converse(wire, clock, np.zeros(0, FRAME), swept, HEARTBEAT_TIME):
         hear(frame, TRIES)
     for id, motor in found.items():

@@ -20,9 +20,9 @@ from sim2real.robot import open_robot
 from sim2real.types import Sim2realError
 
 ASK = {  # by the stops that can be reached
-    "both": "from the middle of its range to its lower end ({low:g} rad) and hold it, then to its upper end ({high:g} rad) and hold it",
-    "upper": "to its upper end ({high:g} rad), hold it, move it away, then to the same end again, and hold it there",
-    "lower": "to its lower end ({low:g} rad), hold it, move it away, then to the same end again, and hold it there",
+    "both": "from the middle of its range to its lower end ({low:g} rad) and hold it, then to its upper end ({high:g} rad) and hold it; then lay the limb back where it hung",
+    "upper": "to its upper end ({high:g} rad), hold it, move it away, then to the same end again, and hold it there; then lay the limb back where it hung",
+    "lower": "to its lower end ({low:g} rad), hold it, move it away, then to the same end again, and hold it there; then lay the limb back where it hung",
 }
 
 
@@ -128,6 +128,8 @@ def _check(calibration: Calibration, path: Path, motors: Motors, wiring: Wiring,
     for m in calibration.motors:
         table.add_row(m.joint, m.fingerprint or f"{m.bus}/{m.id}", f"{m.sign:+d}", f"{m.offset:.4f}", f"{m.span:.3f}")
     console.print(table)
+    for line in motors.warnings:
+        console.print(f"[yellow]know[/] {line}", highlight=False, soft_wrap=True)
     for line in contradictions:
         console.print(f"[red]contradicted[/] {line}", highlight=False, soft_wrap=True)
     if contradictions:
@@ -140,7 +142,7 @@ def _check(calibration: Calibration, path: Path, motors: Motors, wiring: Wiring,
 def _real(config: RobotConfig, wiring: Wiring, seed: int, console: Console) -> tuple[Motors, Any, Any]:
     motors = Motors(config, open_robot(config, bare(wiring)), MonotonicClock())
     ask = lambda joint, what: console.print(f"[bold]{joint}[/]: move it {what}", soft_wrap=True)  # noqa: E731
-    return motors, ask, lambda: console.print("hands off: it is to hang still")
+    return motors, ask, lambda: console.print("hands off: everything is to hang still, left and right alike")
 
 
 def _simulated(config: RobotConfig, wiring: Wiring, seed: int, console: Console) -> tuple[Motors, Any, Any]:

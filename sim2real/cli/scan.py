@@ -83,7 +83,7 @@ def main(argv: list[str]) -> int:
         print(json.dumps(list(found.values()), indent=1))
     else:
         for bus in found.values():
-            _print(Console(), bus["bus"], bus["motors"], bus["error_frames"])
+            _print(Console(), bus["bus"], bus["motors"], bus["error_frames"], bus.get("controller", ""))
         if path:
             Console().print(f"written to {path}", soft_wrap=True)
     bad = sum(len(row["problems"]) for bus in found.values() for row in bus["motors"])
@@ -111,7 +111,7 @@ def _sweep(spec: BusSpec, all_bitrates: bool, world: Any, clock: Clock) -> dict[
     with opened(spec, world, spec.bitrate) as wire:
         swept = sweep(spec.protocol, wire, clock, spec.bitrate)
     garbled += swept.error_frames
-    return {"bus": spec.name, "error_frames": garbled,
+    return {"bus": spec.name, "error_frames": garbled, "controller": swept.controller,
             "motors": strangers + verdicts(swept, spec if spec.motors else None)}  # fmt: skip
 
 
@@ -142,7 +142,7 @@ def _buses(args: Args) -> tuple[list[BusSpec], Any, Clock]:
     return wanted, world, SimClock(world.advance, lambda: world.time)
 
 
-def _print(console: Console, bus: str, rows: list[dict[str, Any]], garbled: int) -> None:
+def _print(console: Console, bus: str, rows: list[dict[str, Any]], garbled: int, controller: str) -> None:
     table = Table(title=f"{bus}: {sum(bool(r['registers']) for r in rows)} motors", title_justify="left")
     for name in ("id", "answers on", "model", "firmware", "joint"):
         table.add_column(name, no_wrap=True)
@@ -164,5 +164,11 @@ def _print(console: Console, bus: str, rows: list[dict[str, Any]], garbled: int)
             )
     if garbled:
         console.print(f"[red]{garbled} error frames[/]: two motors with one id, a wrong bit rate, or a bad cable")
+    if controller:
+        console.print(
+            f"[red]the controller went {controller}[/]: frames were broken off, or nobody acknowledged them. A motor at another "
+            "bit rate does that: `--all-bitrates` asks at all of them (a real interface must be set to each first: `ip link`)",
+            soft_wrap=True,
+        )
     if not rows:
         console.print("[red]nobody answers[/]: check power, wiring, termination and the bit rate")

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from can_bench import rig
+from can_bench import Bench, rig
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -225,6 +225,34 @@ def test_errors():
     assert lengths == [12, 12, 48, 48]  # a stop clears them
     codec.unpack(answer(Mode.POSITION, fault=98), state, 2.0)  # limited, which is no error
     assert not state.error.any() and state.enabled.all()
+
+
+def test_home_state_in_bytes():
+    """registers.md: 00C, one int8. Read by 11 0C, answered by 21 0C."""
+    codec = MoteusCodec(rig("moteus"))
+    asked = codec.pack_register(0, moteus.HOME)
+    assert asked["data"][0, : asked["length"][0]].tobytes() == bytes.fromhex("11 0C")
+    said = make_fd_frames(np.array([0x100], np.uint32), np.array([[0x21, 0x0C, 2]], np.uint8), 3)
+    assert codec.unpack_registers(said) == [(0, moteus.HOME, 2, False)]
+    assert codec.unpack_registers(answer(Mode.STOPPED)) == []
+
+
+OUTPUT = {"motor_position.output.source": 1.0, "motor_position.sources.1.reference": 1.0}
+
+
+def test_a_bus_tells_what_its_positions_are_worth(tmp_path):
+    bench = Bench(tmp_path, "moteus", registers={"right": OUTPUT})
+    assert bench.bus.turns() == pytest.approx([np.pi / 3, 2 * np.pi])
+
+
+@pytest.mark.parametrize(("known", "lost"), [(False, 3 * np.pi / 3), (True, 0.0)])
+def test_a_power_cycle_loses_what_no_encoder_knows(tmp_path, known, lost):
+    bench = Bench(tmp_path, "moteus", registers={"left": OUTPUT} if known else None, joint_pos={"left": 2.9})
+    told = bench.poll(0.02).position[0]
+    assert told == pytest.approx(2.9, abs=0.01)
+    for on in (False, True):
+        bench.world.motors.power(0, on, bench.world.time)
+    assert told - bench.poll(0.02).position[0] == pytest.approx(lost, abs=0.01)
 
 
 def test_wirings_that_cannot_be():

@@ -147,6 +147,28 @@ def test_the_library_reads_every_resolution_of_the_twin(tmp_path, resolution):
     assert said[moteus.Register.TEMPERATURE] == pytest.approx(25.0)
 
 
+def test_the_library_sets_the_position_of_the_twin(tmp_path):
+    bench = Bench(tmp_path, "moteus", connect=False, joint_pos={"left": 0.9})
+    left, R = theirs(bench), moteus.Register
+
+    async def said():
+        return (await left.custom_query({R.POSITION: moteus.F32, R.HOME_STATE: moteus.INT8})).values
+
+    async def drive():
+        before = await said()
+        assert (before[R.HOME_STATE], before[R.POSITION]) == (1, pytest.approx(0.9 / TURN, abs=1e-3))
+        await left.set_output_nearest(position=0.4)
+        after = await said()
+        assert (after[R.HOME_STATE], after[R.POSITION]) == (2, pytest.approx(0.9 / TURN + 2 / 6, abs=1e-3))
+        await left.set_output_exact(position=0.4)
+        assert (await said())[R.POSITION] == pytest.approx(0.4, abs=1e-3)
+        bench.world.motors.power(0, False, bench.world.time)
+        bench.world.motors.power(0, True, bench.world.time)
+        assert (await said())[R.HOME_STATE] == 1
+
+    asyncio.run(asyncio.wait_for(drive(), 30))
+
+
 def test_the_driver_takes_over_where_the_library_stopped(tmp_path):
     bench = Bench(tmp_path, "moteus", connect=False)
 

@@ -10,7 +10,7 @@ from can_bench import Bench, rig
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.bus import BusError, MotorCommand, MotorSpec, MotorState
+from drivers.bus import BusError, BusSpec, MotorCommand, MotorSpec, MotorState
 from drivers.codecs import odrive
 from drivers.codecs.odrive import TURN, AxisState, Command, Law, OdriveCodec, OdriveMotors
 from drivers.wire import EXTENDED, REMOTE, make_frames
@@ -36,6 +36,51 @@ def frame(text: str) -> np.ndarray:
 
 def codec() -> OdriveCodec:
     return OdriveCodec(rig("odrive"))
+
+
+# By the manual of firmware 0.6 and its can_enumerate.py: version 0.6.10; everybody (node 3F) asked for an address, told by
+# node 1 with the serial number 394D35523230 in little-endian.
+def test_version_and_address_in_bytes():
+    spec = modern()
+    host = OdriveCodec(spec)
+    assert hexes(host.pack_register(0, "VERSION")) == ["020#R"]
+    assert len(host.pack_register(0, "SERIAL")) == 0  # 0.5 would take it for a new node id
+    assert host.unpack_registers(frame("020#020404 3A 00060A 00")) == [(0, "VERSION", 0x00060A, False)]
+    assert len(host.pack_register(0, "SERIAL")) == 0  # the other may still have 0.5
+    assert host.unpack_registers(frame("040#020404 3A 000506 00")) == [(1, "VERSION", 0x000506, False)]
+    assert len(host.pack_register(0, "SERIAL")) == 0
+    host.unpack_registers(frame("040#020404 3A 00060A 00"))
+    assert hexes(host.pack_register(0, "SERIAL")) == ["7E6#R"]
+    for raw in ("026#01 303252354D39", "026#01 303252354D39 00"):
+        assert host.unpack_registers(frame(raw)) == [(0, "SERIAL", 0x394D35523230, False)]
+    assert host.unpack_registers(frame("026#02 303252354D39")) == []  # of another node than its identifier says
+    with pytest.raises(KeyError):
+        host.pack_register(0, "VERSION", 1)
+    motors = OdriveMotors(spec)
+    assert hexes(motors.pack_address(0, 0x394D35523230)) == ["026#01303252354D3900"]
+    assert hexes(motors.pack_version(1, 0x00060A)) == ["040#0204043A00060A00"]
+
+
+def modern() -> BusSpec:
+    """Nodes 1 and 2: newer firmware keeps 3F for everybody."""
+    spec = rig("odrive")
+    return replace(spec, motors=tuple(replace(m, id=i + 1) for i, m in enumerate(spec.motors)))
+
+
+@pytest.mark.parametrize(
+    ("versions", "told"),
+    [
+        ((0x000506, 0x000506), ["", ""]),
+        ((0x00060A, 0x000506), ["VERSION 1546", ""]),
+        ((0x00060A, 0x00060B), ["VERSION 1546, SERIAL 62960769970736", "VERSION 1547, SERIAL 62960769970737"]),
+    ],
+)
+def test_an_axis_is_known_by_its_serial_number_where_its_firmware_tells_it(tmp_path, versions, told):
+    registers = {m.joint: {"FIRMWARE": v} for m, v in zip(modern().motors, versions, strict=True)}
+    bench = Bench(tmp_path, "odrive", spec=modern(), registers=registers)
+    assert bench.bus.fingerprints() == told
+    assert bench.world.motors.specs == modern().motors  # nobody has another node id now
+    assert bench.enable().enabled.all()
 
 
 def command(**changes) -> MotorCommand:

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from sim_robots import BOX, BUS, CLEAR, ENABLE, IMU, REFRESH, answers, make_worl
 
 from drivers.bus import BusError
 from drivers.codecs import hipnuc
+from drivers.open import open_imu
 from drivers.sim.bridge import can_bridge
 from drivers.sim.serve import serve, world_of
 from drivers.sim.socket_wire import SocketCanWire, SocketSerialWire, WorldRemote
@@ -69,6 +70,19 @@ def until(condition, seconds: float = 3.0) -> None:
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.005)
+
+
+def test_an_imu_is_set_up_over_its_socket(tmp_path):
+    imu = replace(IMU, protocol="bno085_shtp", rate=100.0, baud=3_000_000)
+    process = start(tmp_path, spec(tmp_path, hang=0.05) | {"imu": asdict(imu)})
+    try:
+        assert process.stdout and process.stdout.readline() == "ready\n"
+        driver = open_imu(imu, SocketSerialWire(tmp_path / "imu.sock"))
+        until(lambda: np.isfinite(driver.read(time.monotonic()).time), 20.0)
+        assert driver.read(time.monotonic()).acceleration_imu_in_imu[2] == pytest.approx(9.8, abs=1.0)
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def test_round_trip_over_sockets(served):

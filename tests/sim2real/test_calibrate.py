@@ -19,6 +19,7 @@ from sim2real.robot import open_robot
 from sim2real.types import Sim2realError
 
 FILE = "bringup/bench-can-sim.calibration.yaml"
+ROBOTS = Path(__file__).resolve().parents[2] / "configs" / "robots"
 
 
 @pytest.fixture(autouse=True)
@@ -48,16 +49,30 @@ def test_whatever_way_it_was_put_together_is_found(seed, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    reason="since the gantry holds a robot upright, a hip that was moved to its stop may stay there, and the check of gravity"
-    " says so; which of the two is wrong is not known yet",
-    strict=False,
-)
 def test_a_whole_humanoid_is_found_and_would_be_armed():
     assert main(["calibrate", "--robot", "g1", "--sim", "--seed", "1"]) == 0
     path = "bringup/g1-can-sim.calibration.yaml"
     agrees(path, 1, "g1")
     assert not list(load_calibration(path).complaints(load_robot("g1"), "can"))
+
+
+def test_hands_lay_a_limb_back_where_they_found_it():
+    """Dropped from its stop it might come down anywhere: a leg has two sets of hip angles that hang straight down."""
+    table = Table()
+    plant, home = table.world.plant, table.world.plant.joint_pos
+    table.measured("shoulder_joint")
+    upper = plant.joint_pos[0]
+    assert upper > 1.9
+    table.person.move("elbow_joint")
+    passed: list[float] = []
+    while table.person._joint == "shoulder_joint":
+        table.motors.clock.sleep_until(table.motors.clock.now() + 0.01)
+        passed.append(float(plant.joint_vel[0]))
+    assert plant.joint_pos[0] == pytest.approx(home[0], abs=0.2)
+    assert max(map(abs, passed)) < 2.5, "it was led, not dropped"
+    table.person.let_go()
+    assert rest(table.motors).joint_vel == pytest.approx([0.0, 0.0], abs=0.05)
+    assert not table.person._joint and not plant.data.qfrc_applied.any()
 
 
 def test_what_was_measured_is_kept_and_gone_on_from(capsys):
@@ -209,6 +224,24 @@ def test_left_and_right_that_hang_otherwise_contradict():
     seen.joint_pos[config.joint_names.index("right_hip_pitch_joint")] = 0.4
     lines = list(checks(config, "imu_in_pelvis", calibration.motors, seen, np.array([1.0, 0, 0, 0])))
     assert not any("hangs at" in line for line in lines)
+
+
+def test_motors_that_tell_no_serial_number_are_named(capsys, tmp_path):
+    """Their calibration is bound to bus and id alone, which is said where it is written."""
+    text = (
+        (ROBOTS / "bench.yaml").read_text().replace("damiao", "mini_cheetah").replace("DM4310, id", "mini-cheetah, id")
+    )
+    text = (
+        text.replace("watchdog: 0.08", "watchdog: 0")
+        .replace(", feedback_id: 0x11", "")
+        .replace(", feedback_id: 0x12", "")
+    )
+    (tmp_path / "bench.yaml").write_text(text)
+    (tmp_path / "bench.xml").write_bytes((ROBOTS / "bench.xml").read_bytes())
+    assert main(["calibrate", "--robot", str(tmp_path / "bench.yaml"), "--sim"]) == 0
+    said = capsys.readouterr().out
+    assert "bus arm: its motors tell no serial number: the calibration knows them by bus and id alone" in said
+    assert [m.fingerprint for m in load_calibration(FILE).motors] == ["", ""]
 
 
 def test_a_robot_that_its_maker_calibrated_is_left_alone(capsys):

@@ -5,13 +5,16 @@ The robots are simulated down to their bytes, behind the same wires, buses and c
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from drivers.codecs.moteus import HomeState
 from drivers.open import open_world
+from drivers.sim.moteus import FIRST_SERIAL
 from sim2real.calibration import Calibration, MotorCalibration, load_calibration
 from sim2real.clock import SimClock
 from sim2real.config import RobotConfig, load_robot
@@ -41,8 +44,8 @@ class Rig:
         assert not self.world.motors.enabled.any()
 
 
-def rig(name: str = "bench", wiring: str = "", calibration: Calibration | None = None, **options) -> Rig:
-    config = load_robot(name)
+def rig(name: str | RobotConfig = "bench", wiring: str = "", calibration: Calibration | None = None, **options) -> Rig:
+    config = name if isinstance(name, RobotConfig) else load_robot(name)
     wiring = wiring or config.default_wiring
     wired = config.wiring(wiring)
     home = dict(zip(config.joint_names, config.home_pos, strict=True))
@@ -144,6 +147,15 @@ def test_a_silent_imu_is_refused():
     assert "IMU: last heard inf s ago" in rig(faults=["off:imu"]).refusal()
 
 
+def test_an_imu_that_has_to_be_set_up_is_waited_for():
+    config = load_robot("bench")
+    wiring = config.wiring()
+    imu = wiring.imu.model_copy(update={"protocol": "bno085_shtp", "baud": 3_000_000, "rate": 400.0})
+    r = rig(config.model_copy(update={"wirings": {"can": wiring.model_copy(update={"imu": imu})}}))
+    r.preflight.run()
+    r.unmoved()
+
+
 def test_a_watchdog_that_does_not_trip_is_refused_by_name():
     r = rig()
     trip = r.world.motors._trip
@@ -188,6 +200,108 @@ def test_a_joint_that_two_turns_bring_into_its_range_is_refused():
     r.preflight.calibration = measured(r.preflight.config, "can")
     r.world.plant.reset([2.0, 0.0])
     assert "shoulder_joint: reads" in (said := r.refusal()) and "fit; move it" in said and "elbow" not in said
+
+
+def bench_of(protocol: str, model: str, rate: float = 250.0, **changes: Any) -> RobotConfig:
+    """The bench with other motors."""
+    bench = load_robot("bench")
+    wiring = bench.wiring("can")
+    motors = [m.model_copy(update={"model": model, "feedback_id": 0}) for m in wiring.buses[0].motors]
+    bus = wiring.buses[0].model_copy(update={"protocol": protocol, "motors": motors} | changes)
+    return bench.model_copy(update={"wirings": {"can": wiring.model_copy(update={"buses": [bus], "rate": rate})}})
+
+
+ENCODER = {"motor_position.output.reference_source": 1.0, "motor_position.sources.1.reference": 1.0}
+
+
+def moteus_rig(*encoders: str, lost: float = 0.0, **options) -> Rig:
+    """``encoders``: the joints with one at the output; ``lost``: rad by which the elbow counted otherwise when it was
+    calibrated."""
+    config = bench_of("moteus", "qdd100-beta2", data_bitrate=5_000_000)  # the rotor turns six times for the joint's one
+    calibration = measured(config, "can")
+    serials = [f"serial_number {moteus_serial(row)}" for row in range(2)]
+    calibration = calibration.model_copy(update={"motors": [
+        m.model_copy(update={"fingerprint": serial, "offset": m.offset + (lost if row else 0.0)})
+        for row, (m, serial) in enumerate(zip(calibration.motors, serials, strict=True))
+    ]})  # fmt: skip
+    return rig(config, calibration=calibration, registers={joint: ENCODER for joint in encoders}, **options)
+
+
+def moteus_serial(row: int) -> int:
+    return sum(word + row * (not i) << 32 * i for i, word in enumerate(FIRST_SERIAL))
+
+
+JOINTS = ("shoulder_joint", "elbow_joint")
+
+
+def test_a_moteus_that_knows_its_rotor_alone_is_refused_in_a_wide_joint():
+    said = moteus_rig("elbow_joint").refusal()
+    assert re.search(
+        r"shoulder_joint: reads .*, its range is -2 to 2 rad: [-.0-9]+, [-.0-9]+, [-.0-9]+, [-.0-9]+ fit; its motor",
+        said,
+    )
+    assert "knows only where in a turn of 1.047 rad it is: give it an output encoder" in said and "elbow" not in said
+
+
+@pytest.mark.parametrize("turns", [-1, 0, 1])
+def test_a_moteus_with_an_output_encoder_is_accepted(turns):
+    """It may have lost turns of the output, and those are put back."""
+    r = moteus_rig(*JOINTS, lost=turns * 2 * np.pi)
+    r.preflight.run()
+    assert r.told == ["whole turns put back since the calibration: elbow_joint"] * bool(turns)
+    np.testing.assert_allclose(r.preflight.look().joint_pos, r.world.plant.joint_pos, atol=0.01)
+
+
+def test_turns_of_a_rotor_are_not_put_back_where_the_output_is_known():
+    """An offset by a turn of the rotor is no lost turn then, but another zero."""
+    said = moteus_rig(*JOINTS, lost=4 * np.pi / 3).refusal()
+    assert "elbow_joint: reads" in said and "no whole turn brings it there" in said
+
+
+def test_a_moteus_whose_position_means_nothing_is_refused():
+    r = moteus_rig(*JOINTS)
+    r.world.motors._home_state = lambda row: HomeState.RELATIVE if row else HomeState.OUTPUT
+    assert "turns:\n  elbow_joint: its motor says that its position is referenced to nothing" in r.refusal()
+
+
+ANONYMOUS = {
+    "recoil": (
+        "6512",
+        0.08,
+        "",
+        ["FIRMWARE_VERSION 65793, FLUX_OFFSET 0.1", "FIRMWARE_VERSION 65793, FLUX_OFFSET 2.499"],
+    ),
+    "odrive": ("D6374-8:1", 0.0, "by bus and id alone", ["", ""]),
+    "mini_cheetah": ("mini-cheetah", 0.0, "by bus and id alone", ["", ""]),
+}
+
+
+@pytest.mark.parametrize("protocol", ANONYMOUS)
+def test_motors_without_a_serial_number_are_known_as_well_as_they_can_be_and_that_is_said(protocol):
+    model, watchdog, said, told = ANONYMOUS[protocol]
+    config = bench_of(protocol, model, watchdog=watchdog)
+    calibration = measured(config, "can")
+    calibration = calibration.model_copy(update={"motors": [
+        m.model_copy(update={"fingerprint": t}) for m, t in zip(calibration.motors, told, strict=True)
+    ]})  # fmt: skip
+    r = rig(config, calibration=calibration)
+    r.preflight.run()
+    warned = [text for text in r.told if "no serial number" in text]
+    assert len(warned) == bool(said) and all(said in text for text in warned)
+    assert any("its motors lose their zero without power, and cannot tell" in text for text in r.told)
+
+
+def test_a_recoil_motor_that_was_replaced_is_refused_by_what_its_calibration_measured():
+    config = bench_of("recoil", "6512")
+    calibration = measured(config, "can").model_copy()
+    told = ANONYMOUS["recoil"][3]
+    calibration = calibration.model_copy(update={"motors": [
+        m.model_copy(update={"fingerprint": t}) for m, t in zip(calibration.motors, told, strict=True)
+    ]})  # fmt: skip
+    said = rig(config, calibration=calibration, registers={"elbow_joint": {"FLUX_OFFSET": 1.25}}).refusal()
+    assert (
+        "elbow_joint: got motor FIRMWARE_VERSION 65793, FLUX_OFFSET 1.25, expected" in said and "shoulder" not in said
+    )
 
 
 def test_another_variant_than_that_of_the_policies_is_refused():
