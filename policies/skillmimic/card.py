@@ -134,13 +134,16 @@ def card(
         f" {100 * GAP:g} points lost on the way there: {'met' if e.good(label) else '**missed**'} ({100 * e.gap(label):+.1f} points)."
         for label in contract.skill_labels
     )
+    throw = json.loads(str(training.get("settings", "{}"))).get("throw", 0.0)
+    planned = float(training.get("plan_samples", 0)) / 1e6
+    plan = f"; the arms' plan under it was found by CMA-ES on {planned:.1f} M samples" if planned else ""
     films = "".join(f"![{label}]({pictures[label]})\n" for label in contract.skill_labels if label in pictures)
     return f"""# {contract.name}, ball skills for {contract.robot}
 
 Measured by `sim2real eval`; do not edit. sha256 `{e.sha256}`
 
 {1 / contract.period:.0f} Hz, {len(contract.target_joint_names)} joints. In: {", ".join(n for n in contract.inputs if not n.startswith("carry_"))}.
-Trained by {training.get("algorithm", "?")} ({training.get("variant", "?")}) on {float(training.get("samples", 0)) / 1e6:.1f} M samples, seed {training.get("seed", "?")}, revision {contract.provenance.revision[:12]}.
+Trained by {training.get("algorithm", "?")} ({training.get("variant", "?")}) on {float(training.get("samples", 0)) / 1e6:.1f} M samples{plan}; seed {training.get("seed", "?")}, revision {contract.provenance.revision[:12]}.
 
 {films}
 ## How well
@@ -150,7 +153,7 @@ each skill's own rule, which for all of them includes: no termination of the tra
 through the bytes no fault of the safety gate. Acc., E_b, E_o (m) and E_cg as in the paper (section 6.2), a right frame
 being one with the ball within {BALL_NEAR:g} m, the body within {BODY_NEAR:g} m and every contact right: the paper's thresholds
 times the robot's length scale. Robots, balls and trackers are drawn from randomisation that training never saw; through
-the bytes, bodies and balls.
+the bytes, bodies and balls. A ball that is thrown flies up to {throw:g} m/s otherwise than in its clip, along each axis.
 
 | skill | where | success | Acc. | E_b | E_o | E_cg |
 |---|---|---|---|---|---|---|

@@ -87,7 +87,7 @@ BALL = {  # a clip each: the calmest, and those that come from and go to the fro
     "hold": "hold_01",
     "carry": "carry_01",
     "pass": "pass_02",
-    "catch": "catch_03",
+    "catch": "catch_06",
     "dribble_in_place": "dribble_in_place_01",
 }
 TASKS: dict[str, SkillMimic] = {

@@ -105,12 +105,12 @@ def optimise(
     generations: int,
     candidates: int,
     each: int,
-    keep: Callable[[Correction], None],
+    keep: Callable[[Correction, int], None],
     seed: int = 0,
 ) -> None:
     """Search for ``generations``, each robot of ``each`` judging every candidate once a generation.
 
-    ``keep`` is given the middle of the search's distribution after every generation. Prints a line for each.
+    ``keep`` is given the middle of the search's distribution after every generation, and how many samples that took. Prints a line for each.
     """
     config = dataclasses.replace(config, skills=(skill,), envs=candidates * each, anywhere=False, push_chance=0.0)
     graph = PolicyGraph(config)
@@ -125,7 +125,7 @@ def optimise(
         asked = es.ask()
         values = score(env, np.array([*asked, es.mean]), search, ticks)
         es.tell(asked, (-values[:-1]).tolist())
-        keep(search.correction(es.mean))
+        keep(search.correction(es.mean), ticks * env.num_envs)
         left = (time.monotonic() - began) / generation * (generations - generation) / 60
         print(
             f"{skill}: {generation} of {generations}, {left:.0f} min left; mean {values[-1]:.3f}, best {values.max():.3f},"
@@ -134,10 +134,12 @@ def optimise(
         )
 
 
-def write(path: Path, skill: str, c: Correction) -> None:
-    """Put a skill's correction into a file, beside the others'."""
+def write(path: Path, skill: str, c: Correction, samples: int = 0) -> None:
+    """Put a skill's correction into a file, beside the others', and add ``samples`` to those that the skill has cost."""
     document = yaml.safe_load(path.read_text()) if path.is_file() else {}
+    before = document.get(skill, {}).get("samples", 0)
     document[skill] = {
+        "samples": before + samples,
         "offsets": [[round(float(x), 4) for x in row] for row in c.offsets],
         "follow": [round(float(x), 4) for x in c.follow],
         "damp": [round(float(x), 4) for x in c.damp],
@@ -159,9 +161,8 @@ def main() -> None:
         sys.exit(f"skill: got '{arguments.skill}', expected one of {', '.join(config.skills)}")
     torch.set_num_threads(1)
     path, skill = ROOT / config.corrections, arguments.skill
-    optimise(
-        config, skill, arguments.generations, arguments.candidates, arguments.each, lambda c: write(path, skill, c)
-    )
+    keep = lambda c, samples: write(path, skill, c, samples)  # noqa: E731
+    optimise(config, skill, arguments.generations, arguments.candidates, arguments.each, keep)
 
 
 if __name__ == "__main__":

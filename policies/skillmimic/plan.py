@@ -97,7 +97,8 @@ class Plan(nn.Module):
 
     def corrections(self, skill: Tensor) -> tuple[Tensor, Tensor]:
         """Offsets (N, KNOTS, arms) and gains (N, 6) of each robot's skill (N, labels)."""
-        return torch.einsum("ns,ska->nka", skill, self.offsets), skill @ self.follow
+        offsets = skill @ self.offsets.flatten(1)  # a matrix product: the runtime knows no einsum
+        return offsets.unflatten(1, self.offsets.shape[1:]), skill @ self.follow
 
     def forward(self, skill: Tensor, last_skill: Tensor, last_clock: Tensor, ball: Tensor) -> Planned:
         """``skill`` (N, labels) one-hot, and that of the tick before with its clock (N, 1); ``ball`` (N, 6) m and m/s in
@@ -149,6 +150,12 @@ def read(path: Path, skills: Sequence[str], arms: int) -> list[Correction]:
             )
         found.append(Correction(np.broadcast_to(offsets, (KNOTS, arms)), follow, damp))
     return found
+
+
+def samples(path: Path, skills: Sequence[str]) -> int:
+    """How many policy periods the search for a file's corrections of ``skills`` has simulated."""
+    document: Mapping = yaml.safe_load(path.read_text()) if path.is_file() else {}
+    return sum(document.get(skill, {}).get("samples", 0) for skill in skills)
 
 
 def _buffer(values: np.ndarray | list) -> Tensor:

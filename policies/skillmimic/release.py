@@ -19,7 +19,8 @@ from policies.physics import standing_height
 from policies.skillmimic.clips import PRESS, grip
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.env import Env
-from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.graph import ROOT, PolicyGraph
+from policies.skillmimic.plan import samples
 from policies.skillmimic.stance import stand
 from policies.skillmimic.train import load_graph
 from policies.training import git_revision
@@ -27,8 +28,9 @@ from sim2real.contract import Contract
 from sim2real.policy import Policy
 from sim2real.types import Sim2realError
 
-SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "walks", "corrections", "timed", "period", "timestep", "action_ratio", "action_max", "grip", "balance_gain",
-            "balance_damping", "position_margin", "history", "frames", "throw", "terminations")  # fmt: skip
+SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "walks", "corrections", "timed", "period",
+            "timestep", "action_ratio", "action_max", "grip", "balance_gain", "balance_damping", "position_margin",
+            "history", "frames", "throw", "terminations")  # fmt: skip
 OPEN = 0.05  # m
 SHOWN, NONE = (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)  # m/s, m/s, rad/s: commands of a timeline that names none
 GOLDEN_STEPS, GOLDEN = 40, 4  # ticks of each golden sequence, and how many
@@ -92,6 +94,7 @@ def export_graph(
                 "variant": config.variant,
                 "seed": config.seed,
                 "settings": settings(config),
+                **({"plan_samples": samples(ROOT / config.corrections, config.skills)} if config.corrections else {}),
                 **(measured or {}),
             },
         },

@@ -218,6 +218,9 @@ def deploy_episode(
     scene = Scene(seed=seed, prepare=random_body(rng), camera=camera, ball=random_ball(rng))
     simulation = deployed(path, steps, scene, [NONE] * (len(steps) - 1) + [command(graph, label, rng)], each_tick)
     starts = {n: ObjectStart.model_validate(object_start(graph, clip if n == label else 0)) for n in {first, label}}
+    if starts[label].how == "thrown":
+        flight = starts[label].velocity + rng.uniform(-config.throw, config.throw, 3)
+        starts[label] = starts[label].model_copy(update={"velocity": tuple(flight.tolist())})
     simulation.handover = Handover(simulation.world, starts)
     summary = simulation.run()
     judge.failed |= bool(summary.faults) or judge.frames < ticks

@@ -13,7 +13,7 @@ from policies.skillmimic.config import TASKS
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PULL, PolicyGraph
 from policies.skillmimic.optimise import Search, optimise, score, write
-from policies.skillmimic.plan import KNOTS, REACH, Correction, Plan, Rows, read
+from policies.skillmimic.plan import KNOTS, REACH, Correction, Plan, Rows, read, samples
 from sim2real.types import Sim2realError
 
 ARMS, T = 2, 8
@@ -93,12 +93,14 @@ def test_palms_follow_a_ball_that_is_elsewhere_as_far_as_they_reach():
 def test_what_was_found_is_read_back(tmp_path):
     path = tmp_path / "plan.yaml"
     some = Correction(np.round(np.random.default_rng(0).normal(size=(KNOTS, ARMS)), 4), np.ones(3), np.zeros(3))
-    write(path, "catch", some)
+    write(path, "catch", some, 10)
+    write(path, "catch", some, 5)
     write(path, "pass", correction())
     (there, none) = read(path, ["catch", "hold"], ARMS)
     for a, b in zip(there, some, strict=True):
         np.testing.assert_allclose(a, b)
     assert not none.offsets.any() and not none.follow.any()
+    assert samples(path, ["catch", "pass", "hold"]) == 15
     document = yaml.safe_load(path.read_text())
     document["catch"]["offsets"] = [[0.0]]
     path.write_text(yaml.safe_dump(document))
@@ -140,7 +142,9 @@ def test_a_search_keeps_what_it_has_found_after_every_generation(monkeypatch, ca
     monkeypatch.setattr("policies.skillmimic.optimise.SECONDS", 0.2)
     config = dataclasses.replace(TASKS["g1-ball"], clips=("hold_01",), threads=1)
     found: list[Correction] = []
-    optimise(config, "hold", generations=2, candidates=4, each=2, keep=found.append)
+    cost: list[int] = []
+    optimise(config, "hold", 2, candidates=4, each=2, keep=lambda c, n: (found.append(c), cost.append(n)))
+    assert cost == [10 * 8] * 2  # 0.2 s of eight robots
     assert len(found) == 2 and found[0].offsets.shape == (1, 14)
     assert np.abs(found[1].offsets - found[0].offsets).max() > 0
     assert "hold: 2 of 2, 0 min left" in capsys.readouterr().out
