@@ -208,7 +208,7 @@ def grip(clip: Clip, model: mujoco.MjModel, body: RobotBody, kp: np.ndarray, for
             if len(holding) == 2:
                 torque += jacobian.T @ (force * towards)
                 press[t] += np.linalg.pinv(jacobian * arms, rcond=1e-2) @ (PRESS * towards)
-            torque -= jacobian.T @ (push[t] / len(holding))
+            torque += jacobian.T @ (push[t] / len(holding))
         if holding:
             centre = (mass * centre + ball.MASS * clip.ball_position_in_world[t]) / (mass + ball.MASS)
             mass += ball.MASS

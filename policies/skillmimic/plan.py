@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from sim2real.types import Sim2realError
 
+GRAVITY = 9.81  # m/s^2
 KNOTS = 8  # of a skill that moves
 REACH = 0.12  # m, the furthest that palms follow the ball
 SLOW = 0.5  # m/s: a ball slower than this says little about the time
@@ -72,6 +73,7 @@ class Plan(nn.Module):
     first: Tensor
     last: Tensor
     loop: Tensor
+    bounce: Tensor
     offsets: Tensor
     follow: Tensor
 
@@ -91,6 +93,8 @@ class Plan(nn.Module):
         self.register_buffer("following", torch.tensor(following))
         self.register_buffer("first", _buffer(first[:, None]))
         self.register_buffer("last", _buffer(lengths[:, None] - 1))
+        jumps = [max(np.ptp(r.velocity[:, 2]) / GRAVITY, 0.1) if r.loop else 1.0 for r in rows]
+        self.register_buffer("bounce", _buffer(np.array(jumps)[:, None]))
         self.register_buffer("loop", _buffer([[r.loop] for r in rows]))
         self.register_buffer("offsets", _buffer(np.stack([c.offsets for c in corrections])))
         self.register_buffer("follow", _buffer(np.stack([np.concatenate([c.follow, c.damp]) for c in corrections])))
@@ -121,12 +125,19 @@ class Plan(nn.Module):
         return Planned(target, clock, error)
 
     def _step(self, skill: Tensor, clock: Tensor, same: Tensor, last: Tensor, loop: Tensor, ball: Tensor) -> Tensor:
-        """The clock, moved on: a row a tick, and faster or slower as the ball is ahead of its plan or behind."""
+        """The clock, moved on: a row a tick, and faster or slower as the ball is ahead of its plan or behind.
+
+        A ball that is caught is where the plan has it, sooner or later. One that bounces may never get that high; its
+        velocity tells the time, and that jumps back by ``bounce`` s on the floor.
+        """
         row = (skill @ self.first + torch.floor(clock))[:, 0].to(torch.int64)
         planned = self.table[row][:, self.arms :]
         velocity = planned[:, 3:6]
-        ahead = ((ball[:, :3] - planned[:, :3]) * velocity).sum(-1, keepdim=True)
-        ahead = ahead / ((velocity * velocity).sum(-1, keepdim=True) + SLOW**2)  # s
+        along = ((ball[:, :3] - planned[:, :3]) * velocity).sum(-1, keepdim=True)
+        along = along / ((velocity * velocity).sum(-1, keepdim=True) + SLOW**2)
+        fallen = (velocity[:, 2:] - ball[:, 5:6]) / GRAVITY
+        bounce = skill @ self.bounce
+        ahead = torch.where(loop > 0, fallen - bounce * torch.round(fallen / bounce), along)  # s
         rate = torch.clamp(same + planned[:, 6:] * ahead, 0.0, 2.0)
         moved = clock + rate
         around = moved - (last + 1) * torch.floor(moved / (last + 1))

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 import yaml
 
+from drivers.sim.ball import MASS
+from policies.clips.library import robot_clips
+from policies.skillmimic.clips import grip
 from policies.skillmimic.config import TASKS
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PULL, PolicyGraph
@@ -71,6 +75,17 @@ def test_a_clock_that_follows_the_ball_waits_for_it_and_hurries_after_it(ball, r
     """At row 3, 1 m/s: a ball two rows behind slows the clock by PULL x 0.04 m x v / (v^2 + 0.5^2)."""
     got = float(at(Plan([rows(pull=PULL)], [correction()]), 3.0, ball).clock) - 3.0
     assert got == pytest.approx(1 - PULL * 0.04 / 1.25 if rate is None else rate, abs=1e-5)
+
+
+@pytest.mark.parametrize(("row", "speed", "seconds"), [(6, 2.0, 0.0), (6, 1.0, 1 / 9.81), (6, 3.0, -1 / 9.81),
+                                                       (6, -3.0, -1 / 9.81)])  # fmt: skip
+def test_a_bouncing_balls_velocity_tells_the_time_however_high_it_gets(row, speed, seconds):
+    """The plan falls to -4 m/s in four rows, leaves the floor at 2 m/s, and is there at row 6. A slower ball has risen
+    for longer; one that falls at 3 m/s is 0.1 s before the floor."""
+    some = rows(loop=True, pull=1.0)
+    some.velocity[:] = np.column_stack([np.zeros((T, 2)), [0, -1, -2, -3, -4, 2, 2, 0]])
+    ball = [0.1, 0.0, -0.3, 0.0, 0.0, speed]
+    assert float(at(Plan([some], [correction()]), float(row), ball).clock) == pytest.approx(row + 1 + seconds, abs=1e-5)
 
 
 def test_offsets_are_spread_over_the_rows_by_their_knots():
@@ -148,3 +163,32 @@ def test_a_search_keeps_what_it_has_found_after_every_generation(monkeypatch, ca
     assert len(found) == 2 and found[0].offsets.shape == (1, 14)
     assert np.abs(found[1].offsets - found[0].offsets).max() > 0
     assert "hold: 2 of 2, 0 min left" in capsys.readouterr().out
+
+
+def test_arms_are_told_of_the_weight_of_the_ball_and_of_what_speeds_it_up(graph):
+    """Virtual work: both palms a metre up lift the ball's weight by a metre, and a ball that is to fall freely weighs
+    nothing."""
+    body, model = graph.body, graph.model
+    arms = np.array([j.group == "arm" for j in graph.robot.joints])
+    clip = next(c for c in robot_clips("g1", "hold") if c.name == "hold_01")
+    frames = len(clip)
+    here = np.tile(clip.joint_pos[5], (frames, 1))
+    still = dataclasses.replace(clip, joint_pos=here, ball_velocity_in_world=np.zeros((frames, 3)))
+    fall = np.outer(np.arange(frames) / clip.fps, [0.0, 0.0, -9.81])
+    free = dataclasses.replace(still, ball_velocity_in_world=fall)
+    none = dataclasses.replace(still, contact=clip.contact & [False, False, True, True])
+    held, falling, empty = (
+        grip(c, model, body, graph.kp, 0.0).effort[5] * graph.kp * arms for c in (still, free, none)
+    )
+    data = mujoco.MjData(model)
+    data.qpos[:3], data.qpos[3:7] = clip.base_position_in_world[5], clip.base_orientation_in_world[5]
+    data.qpos[7:-7] = clip.joint_pos[5]
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    up = np.zeros(len(arms))
+    for site in body.palms:
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jacSite(model, data, jacobian, None, int(site))
+        up += np.linalg.pinv(jacobian[:, 6:-6] * arms) @ [0.0, 0.0, 1.0]
+    assert (held - empty) @ up == pytest.approx(MASS * 9.81, rel=1e-3)
+    assert (falling - empty) @ up == pytest.approx(0.0, abs=0.01)
