@@ -7,7 +7,7 @@ on where in a step the ball arrives, and below four a bounce can gain energy. So
 
 Between two palms that law is wrong: they play ping-pong with the ball, and it falls in a fifth of a second however hard
 they press. A palm is padded and a wrist yields, so ball and palm touch through explicit pairs that are critically damped
-and have the friction of rubber. Then 40 N a palm hold 0.62 kg.
+and have the friction of rubber. Then 30 N a palm hold 0.62 kg.
 """
 
 # MuJoCo ships no types.

@@ -40,7 +40,7 @@ class SkillMimic:
     action_ratio: float = 0.25  # action 1 moves the target by this share of torque / kp
     action_max: float = 6.0
     grip: float = (
-        40.0  # N each palm presses, where the clip has both on the ball: inside the posture actions start from
+        30.0  # N each palm presses, where the clip has both on the ball: inside the posture actions start from
     )
     balance_gain: float = 2.3  # rad of ankle per rad of pitch away from the skill's own; 0 for skills that walk
     balance_damping: float = 0.25  # rad per rad/s

@@ -70,7 +70,7 @@ class Env(VecEnv):
             "sensordata": np.zeros((n, self.substeps, self.model.nsensordata)),
         }
         self.clip, self.row = np.zeros(n, np.intp), np.zeros(n, np.intp)  # what is imitated, and how far it is
-        self._begun = np.zeros(n, np.intp)  # where in the clip an episode started
+        self.since = np.zeros(n, np.intp)  # physics steps since the clip began, whatever a plan's clock says
         self.skill, self.command = torch.zeros(n, len(self.graph.labels)), torch.zeros(n, 3)
         self.carries = {k: torch.zeros(n, *v) for k, v in self.graph.inputs().items() if k.startswith("carry_")}
         self.action, self.target = torch.zeros(n, self.num_actions), torch.zeros(n, joints)
@@ -108,8 +108,7 @@ class Env(VecEnv):
         rewards[~np.isfinite(rewards)] = 0.0
         self.episode_length_buf += 1
         over = self.episode_length_buf.numpy() >= self.max_episode_length
-        since = self._begun + self.episode_length_buf.numpy() * self.substeps
-        beyond = since - self.clips.length[self.clip] + 1  # physics steps past the end of a clip that has one
+        beyond = self.since - self.clips.length[self.clip] + 1  # physics steps past the end of a clip that has one
         over |= self._ends[self.clip] & (beyond * self.config.timestep >= self.config.after)
         timeouts = over & ~self.failures
         self._push()
@@ -157,6 +156,7 @@ class Env(VecEnv):
             out=self._recorded,
         )
         self.row += self.substeps
+        self.since += self.substeps
         if self.graph.plan is not None:
             clock = self.carries["carry_clock"][:, 0].numpy()
             self.row = np.where(self._timed[self.clip], np.round(clock * self.substeps).astype(int), self.row)
@@ -301,7 +301,7 @@ class Env(VecEnv):
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         clip, row = self.clips.sample(rng, k, self.skills)
         self.clip[ids], self.row[ids] = clip, row if self.config.anywhere else 0
-        self._begun[ids] = self.row[ids]
+        self.since[ids] = self.row[ids]
         rows, _ = self.clips.rows(self.clip[ids], self.row[ids])
         qpos, qvel = self.clips.qpos[rows].copy(), self.clips.qvel[rows].copy()
         flies = self.clips.motion(rows, np.ones(k)).contact[:, :1] == 0

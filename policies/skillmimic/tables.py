@@ -86,7 +86,7 @@ def switched(graph: PolicyGraph, first: str, second: str, episodes: int, act: Ac
     with torch.no_grad():
         while not (lost | (ended >= 0)).all():
             late = len(rows) * config.period >= FIRST
-            due = (began < 0) & ~lost & (late | (env.row - rest >= REST / config.timestep))
+            due = (began < 0) & ~lost & (late | (env.since - rest >= REST / config.timestep))
             if due.any():
                 began[due] = len(rows)
                 switch(env, np.flatnonzero(due), nexts[due])
@@ -107,6 +107,6 @@ def switched(graph: PolicyGraph, first: str, second: str, episodes: int, act: Ac
 
 def switch(env: Env, ids: np.ndarray, clips: np.ndarray) -> None:
     """The robots ``ids`` (k,) are told to do now what ``clips`` (k,) show; nothing else about them changes."""
-    env.clip[ids], env.row[ids] = clips, 0
+    env.clip[ids], env.row[ids], env.since[ids] = clips, 0, 0
     env.skill[ids] = one_hot(env.clips.skill[clips], len(env.graph.labels))
     env._observe()

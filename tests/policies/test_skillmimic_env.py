@@ -126,7 +126,7 @@ def test_an_episode_ends_a_while_after_its_clip(mixed):
     env = Env(dataclasses.replace(MIXED, after=0.1, terminations=("broken",)), 3, mixed)
     env.episode_length_buf[:] = 0
     env.clip[:] = np.flatnonzero(~env.clips.swing)[0]
-    env.row[:] = env.clips.length[env.clip] + 20 - env.substeps - 1 - np.arange(8)
+    env.row[:] = env.since[:] = env.clips.length[env.clip] + 20 - env.substeps - 1 - np.arange(8)
     _, _, dones, _ = env.step(still(env))
     assert dones.tolist() == [1] + [0] * 7
 

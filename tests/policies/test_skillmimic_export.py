@@ -78,7 +78,8 @@ def test_a_held_ball_is_where_the_palms_of_the_start_posture_are(graph, file):
         base = body.model.body(graph.robot.base).id
         palms = (data.site_xpos[body.palms] - data.xpos[base]) @ data.xmat[base].reshape(3, 3)
         places[name] = np.linalg.norm(palms - np.array(start.position), axis=1)
-        np.testing.assert_allclose(palms.mean(axis=0), start.position, atol=0.05)
+        # Targets lie above by what arms and ball weigh, in soft motors.
+        np.testing.assert_allclose(palms.mean(axis=0), np.add(start.position, [0.0, 0.0, 0.05]), atol=0.05)
     assert (places["approach_joint_pos"] > RADIUS + 0.04 + 0.02).all()  # the palm's own radius, and air
     assert (places["default_joint_pos"] < RADIUS + 0.04).all()  # they press
 
