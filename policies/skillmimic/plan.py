@@ -109,7 +109,7 @@ class Plan(nn.Module):
         the base."""
         same = (skill * last_skill).sum(dim=-1, keepdim=True)
         last, loop = skill @ self.last, skill @ self.loop
-        clock = self._step(skill, same * last_clock, same, last, loop, ball)
+        clock, rate = self._step(skill, same * last_clock, same, last, loop, ball)
         here = torch.floor(clock)
         share = clock - here
         row = (skill @ self.first + here)[:, 0].to(torch.int64)
@@ -119,13 +119,16 @@ class Plan(nn.Module):
         error = ball - planned[:, self.arms : self.arms + 6]
         offsets, gains = self.corrections(skill)
         moved = error * gains
-        palm = torch.clamp(moved[:, :3] + moved[:, 3:], -REACH, REACH)
+        waits = (rate <= 0) & (same > 0) & (loop == 0)  # for a ball that is still somewhere else
+        palm = torch.where(waits, 0.0, torch.clamp(moved[:, :3] + moved[:, 3:], -REACH, REACH))
         target = planned[:, : self.arms] + (mixed(self.knots)[:, :, None] * offsets).sum(dim=1)
         target = target + (self.back[row] * palm[:, None]).sum(dim=-1)
         return Planned(target, clock, error)
 
-    def _step(self, skill: Tensor, clock: Tensor, same: Tensor, last: Tensor, loop: Tensor, ball: Tensor) -> Tensor:
-        """The clock, moved on: a row a tick, and faster or slower as the ball is ahead of its plan or behind.
+    def _step(
+        self, skill: Tensor, clock: Tensor, same: Tensor, last: Tensor, loop: Tensor, ball: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The clock, moved on, and by how much: a row a tick, and faster or slower as the ball is ahead of its plan or behind.
 
         A ball that is caught is where the plan has it, sooner or later. One that bounces may never get that high; its
         velocity tells the time, and that jumps back by ``bounce`` s on the floor.
@@ -141,7 +144,7 @@ class Plan(nn.Module):
         rate = torch.clamp(same + planned[:, 6:] * ahead, 0.0, 2.0)
         moved = clock + rate
         around = moved - (last + 1) * torch.floor(moved / (last + 1))
-        return torch.where(loop > 0, around, torch.minimum(moved, last))
+        return torch.where(loop > 0, around, torch.minimum(moved, last)), rate
 
 
 def read(path: Path, skills: Sequence[str], arms: int) -> list[Correction]:

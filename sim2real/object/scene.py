@@ -1,7 +1,7 @@
 """The object in a simulation: what is built, who brings it, and what is known of it where nothing is seen.
 
 ``Handover`` is the person with the ball, who brings it as the skill at hand expects to find it. Before the robot moves they stand in front of it with the ball in their hands, for the camera to see. During the soft start
-they bring it to where the policy expects it and keep it there; a moment after the policy took over they let go, or throw.
+they bring it to where the policy expects it and keep it there; a moment after the policy took over they let go, or throw; a ball that flies at the start is aimed for a moment first, where its flight began to fall.
 When a later skill needs it otherwise than it is, they bring it, or another one, again.
 """
 
@@ -17,10 +17,12 @@ from sim2real.contract import Contract, Object, ObjectStart
 from sim2real.skills import Stage
 from sim2real.tracker import ObjectEstimate, ObjectTracker, rotate
 
+GRAVITY = 9.81  # m/s^2
 AWAY = 0.4  # m in front of its place: where a ball waits that will be put into the robot's hands
 COMING, BROUGHT = 0.6, 1.4  # s that bringing it takes, s before the end of the soft start at which it is there
 HANDING_OVER = 0.3  # s for which a ball in the robot's hands is held on to
 CLOSING = 0.8  # s for which it is where the hands come from elsewhere, of a robot that may have walked
+AIMING = 1.6  # s for which it is where it will be thrown from, while the arms go where they wait for it
 REACH = 0.4  # m: a ball farther from its place is not in the robot's hands any more
 
 
@@ -28,14 +30,14 @@ class Handover:
     """Call ``act`` at least as often as policies decide. ``world``: a World, or the remote of one."""
 
     def __init__(self, world: Any, starts: Mapping[str, ObjectStart]) -> None:
-        self._world, self._starts = world, starts
+        self._world, self._starts = world, {label: highest(start) for label, start in starts.items()}
         self._skill = ""  # that the ball was last brought for
         self._let_go = np.inf  # s since the policy took over
 
     def act(self, stage: Stage, skill: str, left: float, since: float) -> None:
         """``left``: s until the soft start ends; ``since``: s since the policy took over, negative before."""
         if since > self._let_go:
-            self._world.let_go_ball()
+            self._release(self._starts[self._skill])
             self._let_go = np.inf
         elif since >= 0 and np.isfinite(self._let_go):
             self._bring(self._starts[self._skill], 0.0)
@@ -54,12 +56,31 @@ class Handover:
 
     def _begin(self, start: ObjectStart, since: float, first: bool) -> None:
         truth = self._world.truth()
-        place, velocity = in_world(start, truth)
-        if start.how != "held":
-            self._world.throw_ball(place, velocity)
+        place, _ = in_world(start, truth)
+        if start.how != "held" and not (start.how == "thrown" and any(start.velocity)):
+            self._release(start)
+        elif start.how == "thrown":
+            self._world.carry_ball(place)
+            self._let_go = since + AIMING
         elif first or np.linalg.norm(place - truth.position_object_in_world) > REACH:
             self._world.carry_ball(place)
             self._let_go = since + (HANDING_OVER if first else CLOSING)
+
+    def _release(self, start: ObjectStart) -> None:
+        if start.how == "held":
+            self._world.let_go_ball()
+        else:
+            self._world.throw_ball(*in_world(start, self._world.truth()))
+
+
+def highest(start: ObjectStart) -> ObjectStart:
+    """Where a falling object that is thrown was, and how it flew, when it began to fall: there a person can hold it until
+    the robot is ready. Others as they are."""
+    time = -start.velocity[2] / GRAVITY
+    if start.how != "thrown" or time <= 0:
+        return start
+    x, y, z = np.subtract(start.position, np.multiply(start.velocity, time)) - [0.0, 0.0, GRAVITY * time**2 / 2]
+    return start.model_copy(update={"position": (x, y, z), "velocity": (*start.velocity[:2], 0.0)})
 
 
 def in_world(start: ObjectStart, truth: Truth, ahead: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from sim2real.config import load_robot
 from sim2real.contract import Object, ObjectStart
 from sim2real.launch import Launch
 from sim2real.object.camera import CameraModel
-from sim2real.object.scene import AWAY, CLOSING, HANDING_OVER, Handover, prepare_for
+from sim2real.object.scene import AIMING, AWAY, CLOSING, HANDING_OVER, Handover, highest, prepare_for
 from sim2real.operators.script import ScriptOperator, Step
 from sim2real.policy import load_policy
 from sim2real.recorder.plot import page
@@ -147,17 +147,34 @@ def test_a_held_ball_is_brought_held_on_to_and_let_go(world):
     assert world.truth().velocity_object_in_world[2] < -1.5  # it falls freely
 
 
-def test_a_ball_is_thrown_when_the_skill_begins_and_again_for_the_next(world):
+def test_a_ball_is_aimed_and_then_thrown_for_every_skill_that_catches(world):
     thrown = ObjectStart(how="thrown", position=(1.5, 0.0, 1.0), velocity=(-3.0, 0.0, 2.0))
     handover = Handover(world, {"catch": thrown, "again": thrown})
     handover.act(Stage.STANDBY, "catch", 9.0, -1.0)
     assert world.plant.ball.carried
-    for label in ("catch", "again"):
-        handover.act(Stage.RUN, label, -1.0, 0.0)
+    for label, since in (("catch", 0.0), ("again", 3.0)):
+        handover.act(Stage.RUN, label, -1.0, since)
+        handover.act(Stage.RUN, label, -1.0, since + AIMING)
+        assert world.plant.ball.carried
+        handover.act(Stage.RUN, label, -1.0, since + AIMING + 0.01)
         truth = world.truth()
         assert np.hypot(*truth.velocity_object_in_world[:2]) == pytest.approx(3.0)
         assert truth.position_object_in_world[2] == pytest.approx(1.0)
         world.advance(world.time + 0.3)
+
+
+def test_a_ball_without_speed_is_dropped_at_once(world):
+    handover = Handover(world, {"dribble": ObjectStart(how="thrown", position=(0.3, -0.3, 1.0))})
+    handover.act(Stage.RUN, "dribble", -1.0, 0.0)
+    assert not world.plant.ball.carried
+
+
+def test_a_falling_ball_is_aimed_where_its_fall_began():
+    """1.962 m/s down after 0.2 s of falling, 0.1962 m, in which it went 0.1 m back at 0.5 m/s."""
+    top = highest(ObjectStart(how="thrown", position=(1.0, 0.0, 1.0), velocity=(-0.5, 0.0, -1.962)))
+    assert top.position == pytest.approx((1.1, 0.0, 1.1962)) and top.velocity == (-0.5, 0.0, 0.0)
+    rising = ObjectStart(how="thrown", position=(1.0, 0.0, 1.0), velocity=(-0.5, 0.0, 1.0))
+    assert highest(rising) is rising
 
 
 def test_a_ball_that_is_in_its_hands_is_left_alone(world):
