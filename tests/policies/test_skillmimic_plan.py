@@ -105,6 +105,14 @@ def test_palms_follow_a_ball_that_is_elsewhere_as_far_as_they_reach():
     np.testing.assert_allclose(at(plan, 3.0, [0, 0, 9, 1, 0, 0]).target, [[0.4, 2.0 * REACH]], atol=1e-6)
 
 
+def test_palms_do_not_follow_a_ball_that_the_plan_still_waits_for():
+    plan = Plan([rows(pull=PULL)], [correction(follow=[0.0, 0.0, 0.5])])
+    coming = [-5.0, 0.0, 0.1, 1.0, 0.0, 0.0]
+    p = at(plan, 3.0, coming)
+    assert float(p.clock) == 3.0
+    np.testing.assert_allclose(p.target, [[0.3, 0.0]], atol=1e-6)
+
+
 def test_what_was_found_is_read_back(tmp_path):
     path = tmp_path / "plan.yaml"
     some = Correction(np.round(np.random.default_rng(0).normal(size=(KNOTS, ARMS)), 4), np.ones(3), np.zeros(3))
