@@ -92,9 +92,12 @@ def test_a_catch_begins_with_the_ball_thrown_as_in_its_clip(graph, file):
     judged = deploy_episode(file, graph, CATCH, 10.0, None, seed=3)
     assert judged.success == 0 and judged.frames > 3  # arms that rest catch nothing
     start = object_start(graph, CATCH)
-    falling = max(0.0, -start["velocity"][2] / 9.81)
-    velocity = judged._rows[round((AIMING + falling) / CONFIG.period) + 1][1]  # seen from the trunk, after being aimed
-    np.testing.assert_allclose(velocity, start["velocity"], atol=0.6)
+    speeds = np.array([row[1] for row in judged._rows])  # seen from the trunk
+    thrown = int(np.argmax(np.linalg.norm(speeds, axis=1) > 2.0))
+    assert thrown * CONFIG.period == pytest.approx(AIMING, abs=0.2)
+    velocity, told = speeds[thrown], np.array(start["velocity"])  # the trunk leans a little
+    assert np.linalg.norm(velocity) == pytest.approx(np.linalg.norm(told), abs=0.4)
+    assert velocity @ told / np.linalg.norm(velocity) / np.linalg.norm(told) > np.cos(0.25)
 
 
 @pytest.mark.slow
