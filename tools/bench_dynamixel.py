@@ -37,9 +37,9 @@ def rows() -> Iterator[Row]:
         sleep(FAULT_AT)
         cost, sdk_cost = np.diff(np.reshape(measured(cycles, perf_counter, 5, 0.01), (2, 2)), axis=0)[0].tolist()
         heard = max(cycles[2]() for _ in range(9))
-    what = f"dynamixel: a lost answer, {heard} of {SERVOS} servos heard, cycle longer by"
-    yield Row(what, f"{cost * 1e3:.2f} ms", f"{sdk_cost * 1e3:.0f} ms dynamixel-sdk, the rest dropped", "", "< 2 ms",
-              cost < LOSS and heard == SERVOS - 1, {"seconds": {"ours": cost, "sdk": sdk_cost}})  # fmt: skip
+    yield Row(f"dynamixel: a lost answer, {heard} of {SERVOS} servos heard, cycle longer by", f"{cost * 1e3:.2f} ms",
+              f"{sdk_cost * 1e3:.0f} ms dynamixel-sdk, the rest dropped", "", "< 2 ms", cost < LOSS and heard == SERVOS - 1,
+              {"seconds": {"ours": cost, "sdk": sdk_cost}})  # fmt: skip
 
 
 @contextmanager
@@ -66,12 +66,9 @@ def measured(cycles: list[Cycle], clock: Callable[[], float], blocks: int, rest:
 
 
 def host(path: str, drain: bool = False) -> Cycle:
-    """Our cycle: goals out, then states in until all have answered or their time is over. Returns how many answered.
-    ``drain``: what came late for the cycle before is read first."""
-    clock, spec, wire = MonotonicClock(), bus_of("XM430-W350", SERVOS, BAUD), PySerialWire(path, BAUD)
-    servos: Any = open_bus(spec, wire)
-    servos.connect(clock)
-    command = MotorCommand(*np.zeros((5, SERVOS)))
+    """Our cycle: goals out (``drain``: late answers in), states in until all have answered or time is over; how many did."""
+    clock, wire, command = MonotonicClock(), PySerialWire(path, BAUD), MotorCommand(*np.zeros((5, SERVOS)))
+    (servos := open_bus(bus_of("XM430-W350", SERVOS, BAUD), wire)).connect(clock)
 
     def cycle() -> int:
         began = clock.now()
