@@ -16,12 +16,11 @@ from policies.clips.resample import resample
 from policies.clips.robot import POINT_NAMES, RobotBody
 from policies.contact_graph import ContactGraph, reference_edges
 from policies.skillmimic.config import SkillMimic
-from policies.skillmimic.plan import Rows
+from policies.skillmimic.plan import GRAVITY, Rows
 from policies.skillmimic.rewards import Motion
 from policies.skillmimic.stance import crouched, stand, trunk
 from policies.skillmimic.world import hands
 
-GRAVITY = 9.81  # m/s^2
 SINGULAR = 0.08  # m/rad: damps the way back from palms to joints where an arm is stretched
 PRESS = 0.004  # m the palms start inside the ball, so that they carry it from the first step on
 

@@ -26,10 +26,8 @@ class SkillMimic:
     # the actor moves every joint, as in the paper.
     base: str | None = None
     corrections: str | None = None  # of the plan of the arms (plan.py), a file; only with a base
-    timed: tuple[str, ...] = (
-        "catch",
-        "dribble_in_place",
-    )  # skills in which the ball, and not the clock, says how far on
+    # skills in which the ball, and not the clock, says how far on
+    timed: tuple[str, ...] = ("catch", "dribble_in_place")
     walks: tuple[str, ...] = ()  # skills during which the base obeys velocity commands
     still: float = 0.3  # share of their episodes without any
     # the policy
@@ -50,9 +48,8 @@ class SkillMimic:
     timestep: float = 0.005  # s of the physics
     frames: int = 60  # ticks in an episode, as in the paper: 1.2 s here, 1.4 s of the recorded motion
     disturbed: float = 0.5  # share of episodes that start beside their reference frame
-    throw: float = (
-        0.1  # m/s, the most by which a ball that flies at the start does so otherwise than in the clip, each way
-    )
+    # m/s, the most by which a ball that flies at the start does so otherwise than in the clip, each way
+    throw: float = 0.1
     push_chance: float = 0.01  # a tick
     push_speed: float = 0.3  # m/s, the largest
     terminations: tuple[str, ...] = ("fallen", "tilted", "ball_lost", "broken")

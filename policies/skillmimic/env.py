@@ -157,7 +157,7 @@ class Env(VecEnv):
         )
         self.row += self.substeps
         self.since += self.substeps
-        if self.graph.plan is not None:
+        if self.graph.base is not None:
             clock = self.carries["carry_clock"][:, 0].numpy()
             self.row = np.where(self._timed[self.clip], np.round(clock * self.substeps).astype(int), self.row)
 

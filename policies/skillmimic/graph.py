@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -15,13 +13,12 @@ from policies.observations import observe as observe_base
 from policies.skillmimic.clips import ReferenceClips
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.observations import Signals, observe, present
-from policies.skillmimic.plan import Plan
+from policies.skillmimic.plan import ROOT, Plan
 from policies.skillmimic.plan import read as corrections
 from policies.skillmimic.world import training_world
 from policies.train import graph_of
 from sim2real.config import RobotConfig, load_robot
 
-ROOT = Path(__file__).resolve().parents[2]
 PULL = 12.0  # rows of the plan, per tick, per s that the ball is ahead of it
 
 
@@ -72,13 +69,12 @@ class PolicyGraph(nn.Module):
         self.register_buffer("drive", _buffer(np.diag(scale)[self.acting]))  # actions to joints
         self.register_buffer("ankles", _buffer(np.array(["ankle_pitch" in name for name in robot.joint_names])))
         self.register_buffer("acts", _buffer(acts))
-        self.plan: Plan | None = None
+        self.plan: Plan  # where there is a base
         if self.base is not None:
             rows = [
                 self.clips.plan(k, self.acting, PULL * (name in config.timed)) for k, name in enumerate(self.labels)
             ]
-            file = ROOT / (config.corrections or "none")
-            self.plan = Plan(rows, corrections(file, self.labels, len(self.acting)))
+            self.plan = Plan(rows, corrections(config.corrections, self.labels, len(self.acting)))
             self.register_buffer("spread", _buffer(np.eye(len(acts))[self.acting]))  # arms to joints
         self.register_buffer("poses", _buffer(self.clips.stances - robot.home_pos))  # (skills, n), of the base
         self.register_buffer("walks", _buffer(np.array([[skill in config.walks] for skill in config.skills])))
@@ -152,7 +148,7 @@ class PolicyGraph(nn.Module):
         )
         ball = torch.cat([inputs["object_position_in_base"], inputs["object_velocity_in_base"]], dim=-1)
         posture, gravity, carried = skill @ self.postures, gravity_in_base(orientation), {}
-        if self.base is None or self.plan is None:
+        if self.base is None:
             planned = torch.zeros(len(skill), 7)
             config = self.config
             ankle = config.balance_gain * (gravity[:, 0:1] - skill @ self.lean) + config.balance_damping * gyro[:, 1:2]

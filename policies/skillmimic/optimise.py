@@ -24,8 +24,8 @@ from policies.skillmimic import plan
 from policies.skillmimic.config import TASKS, SkillMimic
 from policies.skillmimic.env import Env
 from policies.skillmimic.evaluate import ticks_of
-from policies.skillmimic.graph import ROOT, PolicyGraph
-from policies.skillmimic.plan import KNOTS, Correction
+from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.plan import KNOTS, ROOT, Correction
 
 with warnings.catch_warnings():  # that there is no matplotlib
     warnings.simplefilter("ignore", UserWarning)
@@ -85,7 +85,6 @@ def score(env: Env, candidates: np.ndarray, search: Search, ticks: int) -> np.nd
     of = np.tile(np.arange(len(candidates)), each)
     offsets = torch.from_numpy(search.offsets(candidates)[of].astype(np.float32))
     gains = torch.from_numpy(search.gains(candidates)[of].astype(np.float32))
-    assert env.graph.plan is not None
     env.graph.plan.corrections = lambda skill: (offsets, gains)  # type: ignore[method-assign]
     env.reset()
     env.episode_length_buf[:] = 0
@@ -117,7 +116,7 @@ def optimise(
     ticks = ticks_of(graph, 0, SECONDS)
     env = Env(dataclasses.replace(config, frames=ticks), seed, graph)
     search = Search(graph, 0)
-    start = search.vector(plan.read(ROOT / (config.corrections or "none"), [skill], len(graph.acting))[0])
+    start = search.vector(plan.read(config.corrections, [skill], len(graph.acting))[0])
     options = {"popsize": candidates - 1, "seed": seed + 1, "verbose": -9, "CMA_diagonal": 15}
     es = cma.CMAEvolutionStrategy(start, 0.3, options)
     began = time.monotonic()
@@ -134,9 +133,9 @@ def optimise(
         )
 
 
-def write(path: Path, skill: str, c: Correction, samples: int = 0) -> None:
+def write(file: str | Path, skill: str, c: Correction, samples: int = 0) -> None:
     """Put a skill's correction into a file, beside the others', and add ``samples`` to those that the skill has cost."""
-    document = yaml.safe_load(path.read_text()) if path.is_file() else {}
+    document, path = plan.document(file), ROOT / file
     before = document.get(skill, {}).get("samples", 0)
     document[skill] = {
         "samples": before + samples,
@@ -160,8 +159,8 @@ def main() -> None:
     if arguments.skill not in config.skills or config.corrections is None:
         sys.exit(f"skill: got '{arguments.skill}', expected one of {', '.join(config.skills)}")
     torch.set_num_threads(1)
-    path, skill = ROOT / config.corrections, arguments.skill
-    keep = lambda c, samples: write(path, skill, c, samples)  # noqa: E731
+    file, skill = config.corrections, arguments.skill
+    keep = lambda c, samples: write(file, skill, c, samples)  # noqa: E731
     optimise(config, skill, arguments.generations, arguments.candidates, arguments.each, keep)
 
 

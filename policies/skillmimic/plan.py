@@ -8,7 +8,7 @@ caught, it bounces), and by itself elsewhere. Actions are a residual on all of t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from sim2real.types import Sim2realError
 
+ROOT = Path(__file__).resolve().parents[2]
 GRAVITY = 9.81  # m/s^2
 KNOTS = 8  # of a skill that moves
 REACH = 0.12  # m, the furthest that palms follow the ball
@@ -147,29 +148,32 @@ class Plan(nn.Module):
         return torch.where(loop > 0, around, torch.minimum(moved, last)), rate
 
 
-def read(path: Path, skills: Sequence[str], arms: int) -> list[Correction]:
-    """Of every skill, the corrections in a file that ``optimise.py`` wrote; none where the file says nothing of it.
+def document(file: str | Path | None) -> dict[str, dict]:
+    """By skill, what ``optimise.py`` wrote into ``file``, seen from the repository's root; nothing before there is one."""
+    path = ROOT / (file or "")
+    return yaml.safe_load(path.read_text()) if path.is_file() else {}
 
-    Raises Sim2realError.
-    """
-    document: Mapping = yaml.safe_load(path.read_text()) if path.is_file() else {}
+
+def read(file: str | Path | None, skills: Sequence[str], arms: int) -> list[Correction]:
+    """Of every skill, the corrections in ``file``; none where that says nothing of it. Raises Sim2realError."""
+    known = document(file)
     found = []
     for skill in skills:
-        entry = document.get(skill, {"offsets": [[0.0] * arms], "follow": [0.0] * 3, "damp": [0.0] * 3})
+        entry = known.get(skill, {"offsets": [[0.0] * arms], "follow": [0.0] * 3, "damp": [0.0] * 3})
         offsets, follow, damp = (np.array(entry[k], float) for k in ("offsets", "follow", "damp"))
         if offsets.shape not in ((1, arms), (KNOTS, arms)) or follow.shape != (3,) or damp.shape != (3,):
             raise Sim2realError(
-                f"{path}: '{skill}': got offsets {offsets.shape}, follow {follow.shape}, damp {damp.shape}, expected"
+                f"{file}: '{skill}': got offsets {offsets.shape}, follow {follow.shape}, damp {damp.shape}, expected"
                 f" (1 or {KNOTS}, {arms}), (3,), (3,): optimise it again (policies/skillmimic/optimise.py)"
             )
         found.append(Correction(np.broadcast_to(offsets, (KNOTS, arms)), follow, damp))
     return found
 
 
-def samples(path: Path, skills: Sequence[str]) -> int:
+def samples(file: str | Path | None, skills: Sequence[str]) -> int:
     """How many policy periods the search for a file's corrections of ``skills`` has simulated."""
-    document: Mapping = yaml.safe_load(path.read_text()) if path.is_file() else {}
-    return sum(document.get(skill, {}).get("samples", 0) for skill in skills)
+    known = document(file)
+    return sum(known.get(skill, {}).get("samples", 0) for skill in skills)
 
 
 def _buffer(values: np.ndarray | list) -> Tensor:

@@ -19,7 +19,7 @@ from policies.physics import standing_height
 from policies.skillmimic.clips import PRESS, grip
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.env import Env
-from policies.skillmimic.graph import ROOT, PolicyGraph
+from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.plan import samples
 from policies.skillmimic.stance import stand
 from policies.skillmimic.train import load_graph
@@ -94,7 +94,7 @@ def export_graph(
                 "variant": config.variant,
                 "seed": config.seed,
                 "settings": settings(config),
-                **({"plan_samples": samples(ROOT / config.corrections, config.skills)} if config.corrections else {}),
+                **({"plan_samples": samples(config.corrections, config.skills)} if config.corrections else {}),
                 **(measured or {}),
             },
         },

@@ -19,7 +19,7 @@ from policies.clips.robot import POINT_NAMES
 from policies.skillmimic.evaluate import Measures, Trace, measure, succeeded, ticks_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.randomisation import TABLE
-from policies.skillmimic.release import object_start
+from policies.skillmimic.release import NONE, object_start
 from policies.skillmimic.rewards import Motion, Step
 from policies.skillmimic.stance import Place, arms, moved
 from policies.skillmimic.terminations import failed, up
@@ -31,7 +31,6 @@ from sim2real.simulation import Scene, Simulation
 
 BEFORE = 2.0  # s of the policy's first skill before another one begins
 AFTER = 0.1  # s that a run goes on after what is judged
-NONE = (0.0, 0.0, 0.0)
 
 
 class Judge:
@@ -93,11 +92,8 @@ class Judge:
 
     def _now(self, policy: Any) -> float | None:
         """How far the plan is, in ticks, of a skill whose plan waits for its ball."""
-        return (
-            float(policy.carries["carry_clock"][0])
-            if self.graph.plan is not None and self.label in self.graph.config.timed
-            else None
-        )
+        waits = self.graph.base is not None and self.label in self.graph.config.timed
+        return float(policy.carries["carry_clock"][0]) if waits else None
 
     def _comparable(self, state: Motion, reference: Motion, qvel: np.ndarray, body: _Body) -> tuple[Motion, Motion]:
         """Both where training compares them: seen from the trunk if the legs are a base policy's, else laid on the clip."""

@@ -1,7 +1,9 @@
 """The object in a simulation: what is built, who brings it, and what is known of it where nothing is seen.
 
-``Handover`` is the person with the ball, who brings it as the skill at hand expects to find it. Before the robot moves they stand in front of it with the ball in their hands, for the camera to see. During the soft start
-they bring it to where the policy expects it and keep it there; a moment after the policy took over they let go, or throw; a ball that flies at the start is aimed for a moment first, where its flight began to fall.
+``Handover`` is the person with the ball, who brings it as the skill at hand expects to find it. Before the robot moves
+they stand in front of it with the ball in their hands, for the camera to see. During the soft start
+they bring it to where the policy expects it and keep it there; a moment after the policy took over they let go, or throw;
+a ball that flies at the start is aimed for a moment first, where it begins to fall.
 When a later skill needs it otherwise than it is, they bring it, or another one, again.
 """
 
@@ -57,11 +59,11 @@ class Handover:
     def _begin(self, start: ObjectStart, since: float, first: bool) -> None:
         truth = self._world.truth()
         place, _ = in_world(start, truth)
-        if start.how != "held" and not (start.how == "thrown" and any(start.velocity)):
-            self._release(start)
-        elif start.how == "thrown":
+        if start.how == "thrown" and any(start.velocity):
             self._world.carry_ball(place)
             self._let_go = since + AIMING
+        elif start.how != "held":
+            self._release(start)
         elif first or np.linalg.norm(place - truth.position_object_in_world) > REACH:
             self._world.carry_ball(place)
             self._let_go = since + (HANDING_OVER if first else CLOSING)

@@ -15,7 +15,7 @@ from policies.skillmimic.card import BallActor
 from policies.skillmimic.config import TASKS
 from policies.skillmimic.evaluate import evaluate_skill, ticks_of
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.release import approach, export_graph, object_start, start_posture
+from policies.skillmimic.release import approach, object_start, start_posture
 from policies.skillmimic.stance import moved
 from policies.skillmimic.through_bytes import command, deploy_episode
 from sim2real.object.camera import CameraModel
@@ -27,14 +27,7 @@ CONFIG = dataclasses.replace(
 )
 HOLD, CARRY, CATCH = range(3)
 
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    """Two threads of torch spin against each other on a busy machine."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
@@ -45,13 +38,6 @@ def graph():
     torch.nn.init.zeros_(graph.actor.weight)
     torch.nn.init.zeros_(graph.actor.bias)
     return graph.eval()
-
-
-@pytest.fixture(scope="module")
-def file(graph, tmp_path_factory):
-    path = tmp_path_factory.mktemp("policy") / "ball.onnx"
-    export_graph(graph, path)
-    return path
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import torch
 from drivers.sim.ball import RADIUS
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.release import export_graph, graph_of, object_start, record
+from policies.skillmimic.release import graph_of, object_start, record
 from policies.skillmimic.through_bytes import deploy_episode
 from sim2real.object.camera import CameraModel
 from sim2real.policy import load_policy
@@ -27,13 +27,6 @@ def graph():
     torch.nn.init.normal_(graph.actor[2].weight, std=1e-3)
     torch.nn.init.zeros_(graph.actor[2].bias)
     return graph.eval()
-
-
-@pytest.fixture(scope="module")
-def file(graph, tmp_path_factory):
-    path = tmp_path_factory.mktemp("policy") / "hold.onnx"
-    export_graph(graph, path)
-    return path
 
 
 @pytest.mark.slow

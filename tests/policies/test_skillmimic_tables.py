@@ -27,11 +27,7 @@ CONFIG = dataclasses.replace(
     TASKS["g1-ball"], skills=("hold", "carry", "catch"), clips=("hold_05", "carry_01", "catch_05"), threads=1
 )
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Two threads of torch spin against each other on a busy machine."""
-    torch.set_num_threads(1)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

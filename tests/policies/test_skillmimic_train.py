@@ -20,11 +20,7 @@ TINY = dataclasses.replace(
     evaluate_every=2, evaluate_envs=4, evaluate_seconds=0.1, save_every=1,
 )  # fmt: skip
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Two threads of torch spin against each other on a busy machine."""
-    torch.set_num_threads(1)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_a_run_writes_its_settings_its_curve_and_its_best_policy(tmp_path):
