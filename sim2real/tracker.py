@@ -142,11 +142,11 @@ class ObjectTracker:
     def estimate(self, now: float, orientation_base_in_world: np.ndarray) -> ObjectEstimate:
         """For ``now`` (s), and remember the orientation (4,) of now. The same object every time.
 
-        Everything is NaN before the first sample and while the orientation is not finite; old estimates stay, with an
-        ``age`` that tells.
+        Everything is NaN before the first sample and while the orientation is none (not finite, or the zeros of an IMU
+        that has not spoken); old estimates stay, with an ``age`` that tells.
         """
         e = self.current
-        if not np.isfinite(orientation_base_in_world).all():
+        if not 0.9 < orientation_base_in_world @ orientation_base_in_world < 1.1:
             e.position_in_base[:], e.velocity_in_base[:] = np.nan, np.nan
             return e
         self._turned.append((now, np.array(orientation_base_in_world, float)))

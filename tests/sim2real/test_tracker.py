@@ -149,3 +149,14 @@ def test_the_camera_is_late_and_loses_pictures():
             assert now - sample.time >= 0.03
             seen += 1
     assert seen == pytest.approx(4.0 * 60 * 0.75, rel=0.1)
+
+
+@pytest.mark.parametrize("nothing", [np.zeros(4), np.full(4, np.nan), np.array([np.inf, 0, 0, 0])])
+def test_a_sighting_is_not_placed_by_an_imu_that_has_not_spoken(nothing):
+    tracker, seen = ObjectTracker(RADIUS, height=HEIGHT), np.array([0.5, 0.1, 0.2])
+    tracker.estimate(0.0, nothing)
+    assert not tracker.measure(ObjectSample(0.0, seen))
+    tracker.estimate(0.02, UPRIGHT)
+    assert tracker.measure(ObjectSample(0.02, seen))
+    assert tracker.estimate(0.02, UPRIGHT).position_in_base == pytest.approx(seen)
+    assert np.isnan(tracker.estimate(0.04, nothing).position_in_base).all()
