@@ -22,10 +22,13 @@ from policies.skillmimic.amp import Discriminator, features
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.observations import observe
+from policies.skillmimic.plan import GRAVITY
 from policies.skillmimic.randomisation import LOSS_TICKS, Randomisation
 from policies.skillmimic.rewards import SENSITIVITIES, Motion, Step, reward
 from policies.skillmimic.stance import arms, moved
+from policies.skillmimic.starts import thrown
 from policies.skillmimic.terminations import failed, up
+from sim2real.object.scene import AIMING
 
 BASE, JOINTS, BALL = slice(0, 7), slice(7, -7), slice(-7, -4)  # of qpos
 SPIN, RATES, FLIGHT = slice(3, 6), slice(6, -6), slice(-6, -3)  # of qvel
@@ -59,6 +62,7 @@ class Env(VecEnv):
         timed = np.array([name in config.timed for name in config.skills])
         self._timed = timed[self.clips.skill]  # whose clock is the plan's
         self._ends = ~(self.clips.swing | self.clips.loop)
+        self._throws = {k: t for k in range(len(self.clips.names)) if (t := thrown(self.graph, k))}
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._anchors, self._sites = self.batch.bind("xanchor"), self.batch.bind("site_xpos")
         self._bodies, self._turns = self.batch.bind("xpos"), self.batch.bind("xquat")
@@ -70,7 +74,10 @@ class Env(VecEnv):
             "sensordata": np.zeros((n, self.substeps, self.model.nsensordata)),
         }
         self.clip, self.row = np.zeros(n, np.intp), np.zeros(n, np.intp)  # what is imitated, and how far it is
-        self.since = np.zeros(n, np.intp)  # physics steps since the clip began, whatever a plan's clock says
+        # Physics steps since the clip began, whatever a plan's clock says; negative while the ball is aimed.
+        self.since = np.zeros(n, np.intp)
+        self._aims = np.zeros(n, np.intp)  # ticks until a ball that is thrown flies
+        self._miss = np.zeros((n, 3))  # m/s by which a ball flies otherwise than in its clip
         self.skill, self.command = torch.zeros(n, len(self.graph.labels)), torch.zeros(n, 3)
         self.carries = {k: torch.zeros(n, *v) for k, v in self.graph.inputs().items() if k.startswith("carry_")}
         self.action, self.target = torch.zeros(n, self.num_actions), torch.zeros(n, joints)
@@ -141,6 +148,7 @@ class Env(VecEnv):
     def _act(self, action: Tensor) -> None:
         """Send the action's targets, late by each robot's delay, and let the physics run."""
         before = self.target.numpy()
+        self._aim()
         self.action = self.graph.clip(action)
         self.target = self.graph.target(self.measured, self.action)
         self.carries = self.graph.carries(self.measured, self.action)
@@ -161,6 +169,25 @@ class Env(VecEnv):
             clock = self.carries["carry_clock"][:, 0].numpy()
             self.row = np.where(self._timed[self.clip], np.round(clock * self.substeps).astype(int), self.row)
 
+    def _aim(self) -> None:
+        """Whoever throws holds the ball where it will fly from, in front of a base that may move, until they let go."""
+        ids = np.flatnonzero(self._aims)
+        if len(ids) == 0:
+            return
+        goes = (self._aims[ids] == 1)[:, None]
+        self._qpos[ids, BALL], flight = self._flight(self.clip[ids], self._qpos[ids])
+        held = [0.0, 0.0, GRAVITY * self.config.period / 2]  # m/s, that fall brings back within a period
+        self._qvel[ids, FLIGHT] = np.where(goes, flight + self._miss[ids], held)
+        self._aims[ids] -= 1
+
+    def _flight(self, clip: np.ndarray, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the balls of clips ``clip`` (k,) are thrown from, (k, 3) m, and how, (k, 3) m/s, at robots of ``qpos`` (k, nq)."""
+        place, velocity = np.array([self._throws[c] for c in clip]).transpose(1, 0, 2)
+        w, x, y, z = qpos[:, 3:7].T
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        turn = quaternion_from_rotation_vector(yaw[:, None] * [0.0, 0.0, 1.0])
+        return qpos[:, :3] * [1.0, 1.0, 0.0] + rotate(turn, place), rotate(turn, velocity)
+
     def _judge(self, action_change: np.ndarray) -> Step:
         """The state and its reference, one physics step before now."""
         qpos, qvel = self._recorded["qpos"][:, -2], self._recorded["qvel"][:, -2]
@@ -177,7 +204,7 @@ class Env(VecEnv):
             object_velocity=qvel[:, FLIGHT],
             contact=touched.astype(float),
         )
-        reference = self.reference(*self.clips.rows(self.clip, self.row - 1))
+        reference = self.reference(*self.clips.rows(self.clip, np.maximum(self.row - 1, 0)))
         acceleration = (state.joint_vel - self._last_joint_vel) / self.config.period
         self._last_points, self._last_joint_vel = points, state.joint_vel.copy()
         gone = self._ends[self.clip] & (self.row >= self.clips.length[self.clip]) & (reference.contact[:, 0] == 0)
@@ -301,17 +328,26 @@ class Env(VecEnv):
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         clip, row = self.clips.sample(rng, k, self.skills)
         self.clip[ids], self.row[ids] = clip, row if self.config.anywhere else 0
-        self.since[ids] = self.row[ids]
+        waits = self._wait(ids)
+        self.row[ids[waits]] = 0
+        self.since[ids] = self.row[ids] - self.substeps * np.maximum(self._aims[ids] - 1, 0)
         rows, _ = self.clips.rows(self.clip[ids], self.row[ids])
-        qpos, qvel = self.clips.qpos[rows].copy(), self.clips.qvel[rows].copy()
+        qpos, qvel, target = self.clips.qpos[rows].copy(), self.clips.qvel[rows].copy(), self.clips.target[rows].copy()
         flies = self.clips.motion(rows, np.ones(k)).contact[:, :1] == 0
-        qvel[:, FLIGHT] += flies * rng.uniform(-self.config.throw, self.config.throw, (k, 3))
+        self._miss[ids] = flies * rng.uniform(-self.config.throw, self.config.throw, (k, 3))
+        qvel[:, FLIGHT] += self._miss[ids]
+        if waits.any():  # the ball is in other hands, and the arms come from somewhere between here and home
+            arms_home = waits[:, None] * rng.random((k, 1)) * self.graph.acts.numpy()
+            qpos[:, JOINTS] += arms_home * (self.graph.robot.home_pos - qpos[:, JOINTS])
+            target += arms_home * (self.graph.robot.home_pos - target)
+            qvel[waits] = 0.0
+            qpos[waits, BALL], _ = self._flight(clip[waits], qpos[waits])
         self._disturb(qpos, qvel, rng.random(k) < self.config.disturbed)
         self._qpos[ids], self._qvel[ids] = qpos, qvel
         self._recorded["qpos"][ids], self._recorded["qvel"][ids] = qpos[:, None], qvel[:, None]
         self._recorded["sensordata"][ids] = 0.0
         self.skill[ids] = one_hot(self.clips.skill[self.clip[ids]], len(self.graph.labels))
-        self.target[ids] = _tensor(self.clips.target[rows])
+        self.target[ids] = _tensor(target)
         self.action[ids] = 0.0
         for carry in self.carries.values():
             carry[ids] = 0.0
@@ -338,6 +374,17 @@ class Env(VecEnv):
             self._last_features[ids] = features(self.reference(*before))
         self._last_joint_vel[ids] = qvel[:, RATES]
         self.episode_length_buf[ids] = 0
+
+    def _wait(self, ids: np.ndarray) -> np.ndarray:
+        """(k,) bool, whose ball is aimed before it is thrown: in training half of those who can, for up to AIMING."""
+        config, longest = self.config, round(AIMING / self.config.period)
+        some = np.isin(self.clip[ids], list(self._throws))
+        if config.anywhere:
+            ticks = self.rng.integers(1, longest, size=len(ids), endpoint=True)
+            self._aims[ids] = np.where(some & (self.rng.random(len(ids)) < 0.5), ticks, 0)
+        else:
+            self._aims[ids] = some * longest
+        return self._aims[ids] > 0
 
     def _disturb(self, qpos: np.ndarray, qvel: np.ndarray, chosen: np.ndarray) -> None:
         """Move the starts ``chosen`` (k,) bool beside their reference, in place: all of the robot, with the ball."""

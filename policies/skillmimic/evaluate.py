@@ -16,6 +16,7 @@ from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.randomisation import TABLE
 from policies.skillmimic.rewards import Step
+from policies.skillmimic.starts import aiming
 
 # The paper's thresholds of a right frame, times the robot's length scale of 0.744: ball within 0.2 m, body within 0.1 m.
 BALL_NEAR, BODY_NEAR = 0.149, 0.074  # m
@@ -106,11 +107,11 @@ def succeeded(skill: str, trace: Trace, period: float, ticks: int) -> float:
 
 def ticks_of(graph: PolicyGraph, clip: int, seconds: float) -> int:
     """Of an episode of ``seconds`` from the beginning of clip number ``clip``; where that ends, at most ``config.after`` s
-    beyond."""
+    beyond. A ball that is thrown is aimed before."""
     clips, config = graph.clips, graph.config
     if not (clips.swing[clip] or clips.loop[clip]):
         seconds = min(seconds, (clips.length[clip] - 1) * config.timestep + config.after)
-    return math.ceil(seconds / config.period - 1e-6)
+    return math.ceil((seconds + aiming(graph, clip)) / config.period - 1e-6)
 
 
 class Result(NamedTuple):
@@ -177,8 +178,9 @@ def evaluate_skill(
             frames += running
             running &= ~dones.numpy().astype(bool)
     everything = Trace(*(np.stack(values) for values in zip(*rows, strict=True)))
+    ticks = {clip: ticks_of(graph, clip, seconds) for clip in np.unique(clips)}
     shares = [
-        succeeded(skill, Trace(*(x[:end, n] for x in everything)), config.period, ticks_of(graph, clips[n], seconds))
+        succeeded(skill, Trace(*(x[:end, n] for x in everything)), config.period, ticks[clips[n]])
         for n, end in enumerate(frames)
     ]
     return result(np.array(shares), sums, frames)

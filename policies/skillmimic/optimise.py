@@ -13,6 +13,7 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -76,6 +77,30 @@ class Search:
         return np.concatenate([own.ravel(), c.follow / GAIN, c.damp / DAMP])
 
 
+class Alike(np.random.Generator):
+    """Random numbers that are the same for every candidate: of ``each`` robots, repeated for ``candidates``, so that luck
+    decides less. What is drawn for some of all robots (that start anew after a failure) is not shared."""
+
+    def __init__(self, seed: int, each: int, candidates: int) -> None:
+        super().__init__(np.random.PCG64(seed))
+        self._each, self._candidates = each, candidates
+
+    def random(self, size: Any = None) -> Any:  # type: ignore[override]
+        return self._repeated(super().random, size)
+
+    def standard_normal(self, size: Any = None) -> Any:  # type: ignore[override]
+        return self._repeated(super().standard_normal, size)
+
+    def uniform(self, low: Any = 0.0, high: Any = 1.0, size: Any = None) -> Any:  # type: ignore[override]
+        return self._repeated(lambda size: super(Alike, self).uniform(low, high, size), size)
+
+    def _repeated(self, draw: Callable[[Any], Any], size: Any) -> Any:
+        count, *rest = size if isinstance(size, tuple) else (size,)
+        if count != self._each * self._candidates:
+            return draw(size)
+        return np.repeat(draw((self._each, *rest)), self._candidates, axis=0)
+
+
 def score(env: Env, candidates: np.ndarray, search: Search, ticks: int) -> np.ndarray:
     """(candidates,): mean reward of a tick, 0 after a failure, plus half the share of ticks before one.
 
@@ -115,6 +140,7 @@ def optimise(
     graph = PolicyGraph(config)
     ticks = ticks_of(graph, 0, SECONDS)
     env = Env(dataclasses.replace(config, frames=ticks), seed, graph)
+    env.rng = Alike(seed, each, candidates)
     search = Search(graph, 0)
     start = search.vector(plan.read(config.corrections, [skill], len(graph.acting))[0])
     options = {"popsize": candidates - 1, "seed": seed + 1, "verbose": -9, "CMA_diagonal": 15}

@@ -85,7 +85,7 @@ def switched(graph: PolicyGraph, first: str, second: str, episodes: int, act: Ac
     rows: list[Trace] = []
     with torch.no_grad():
         while not (lost | (ended >= 0)).all():
-            late = len(rows) * config.period >= FIRST
+            late = env.since >= FIRST / config.timestep
             due = (began < 0) & ~lost & (late | (env.since - rest >= REST / config.timestep))
             if due.any():
                 began[due] = len(rows)

@@ -19,9 +19,10 @@ from policies.clips.robot import POINT_NAMES
 from policies.skillmimic.evaluate import Measures, Trace, measure, succeeded, ticks_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.randomisation import TABLE
-from policies.skillmimic.release import NONE, object_start
+from policies.skillmimic.release import NONE
 from policies.skillmimic.rewards import Motion, Step
 from policies.skillmimic.stance import Place, arms, moved
+from policies.skillmimic.starts import object_start
 from policies.skillmimic.terminations import failed, up
 from policies.through_bytes import deployed, random_body
 from sim2real.contract import ObjectStart

@@ -15,8 +15,8 @@ from policies.skillmimic.card import BallActor
 from policies.skillmimic.config import TASKS
 from policies.skillmimic.evaluate import evaluate_skill, ticks_of
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.release import approach, object_start, start_posture
 from policies.skillmimic.stance import moved
+from policies.skillmimic.starts import approach, object_start, start_posture
 from policies.skillmimic.through_bytes import command, deploy_episode
 from sim2real.object.camera import CameraModel
 from sim2real.object.scene import AIMING

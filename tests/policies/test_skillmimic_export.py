@@ -10,7 +10,8 @@ import torch
 from drivers.sim.ball import RADIUS
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.release import graph_of, object_start, record
+from policies.skillmimic.release import graph_of, record
+from policies.skillmimic.starts import object_start
 from policies.skillmimic.through_bytes import deploy_episode
 from sim2real.object.camera import CameraModel
 from sim2real.policy import load_policy
