@@ -22,6 +22,7 @@ from policies.skillmimic.stance import crouched, stand, trunk
 from policies.skillmimic.world import hands
 
 SINGULAR = 0.08  # m/rad: damps the way back from palms to joints where an arm is stretched
+LEVER = 0.3  # m: of palms, a rad counts as this far
 PRESS = 0.004  # m the palms start inside the ball, so that they carry it from the first step on
 
 
@@ -144,7 +145,7 @@ class ReferenceClips:
         if self.swing[clip]:
             target, ball_in_base = self.mean(skill)[0][None, acting], ball_in_base.mean(axis=0, keepdims=True)
             velocity, pulls = np.zeros((1, 3)), np.zeros(1)
-        data, back = mujoco.MjData(self._model), np.zeros((len(target), len(acting), 3))
+        data, back = mujoco.MjData(self._model), np.zeros((len(target), len(acting), 4))
         for t in range(len(target)):
             if gone[t]:
                 continue
@@ -153,8 +154,9 @@ class ReferenceClips:
             mujoco.mj_comPos(self._model, data)
             for site in self._body.palms[self.hands[clip]]:
                 link = self._model.site_bodyid[site]
-                jacobian = _jacobian(self._model, data, data.site_xpos[site], link)[:, acting]
-                back[t] += jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + SINGULAR**2 * np.eye(3))
+                moves, turns = _jacobian(self._model, data, data.site_xpos[site], link)[:, :, acting]
+                back[t, :, :3] += _inverse(moves)
+                back[t, :, 3:] += _inverse(np.concatenate([moves, LEVER * turns[1:2]]))[:, 3:] * LEVER
         return Rows(target, ball_in_base, velocity, back, bool(self.loop[clip]), pulls)
 
     def _gone(self, clip: int, at: np.ndarray) -> np.ndarray:
@@ -203,7 +205,7 @@ def grip(clip: Clip, model: mujoco.MjModel, body: RobotBody, kp: np.ndarray, for
         for site, link in holding:
             towards = clip.ball_position_in_world[t] - data.site_xpos[site]
             towards /= np.linalg.norm(towards)
-            jacobian = _jacobian(model, data, data.site_xpos[site], link)
+            jacobian, _ = _jacobian(model, data, data.site_xpos[site], link)
             if len(holding) == 2:
                 torque += jacobian.T @ (force * towards)
                 press[t] += np.linalg.pinv(jacobian * arms, rcond=1e-2) @ (PRESS * towards)
@@ -215,17 +217,22 @@ def grip(clip: Clip, model: mujoco.MjModel, body: RobotBody, kp: np.ndarray, for
             off = centre - np.mean([data.site_xpos[site] for site, _ in standing], axis=0)
             for site, link in standing:
                 point = data.site_xpos[site] + [off[0], off[1], 0]
-                torque -= _jacobian(model, data, point, link).T @ [0, 0, mass * GRAVITY / len(standing)]
+                torque -= _jacobian(model, data, point, link)[0].T @ [0, 0, mass * GRAVITY / len(standing)]
         legs = np.array([j.group == "leg" for j in body.robot.joints])
         effort[t] = np.where(legs & (not standing), 0.0, torque / kp)
     return Grip(press, effort)
 
 
 def _jacobian(model: mujoco.MjModel, data: mujoco.MjData, point: np.ndarray, link: int) -> np.ndarray:
-    """(3, n) of a point (3,) m in the world on a body, by the robot's joints."""
-    jacobian = np.zeros((3, model.nv))
-    mujoco.mj_jac(model, data, jacobian, None, np.asarray(point, float), int(link))
-    return jacobian[:, 6:-6]
+    """(2, 3, n) of a point (3,) m in the world on a body, and of how that turns, by the robot's joints."""
+    jacobian = np.zeros((2, 3, model.nv))
+    mujoco.mj_jac(model, data, jacobian[0], jacobian[1], np.asarray(point, float), int(link))
+    return jacobian[:, :, 6:-6]
+
+
+def _inverse(jacobian: np.ndarray) -> np.ndarray:
+    """(n, k) of a jacobian (k, n), damped."""
+    return jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + SINGULAR**2 * np.eye(len(jacobian)))
 
 
 def _check(clip: Clip, body: RobotBody) -> None:

@@ -356,14 +356,16 @@ class Env(VecEnv):
             self.carries["carry_clock"][ids] = _tensor(
                 np.where(self.clips.swing[clip], 0.0, self.row[ids] / self.substeps)[:, None]
             )
+            self.carries["carry_arms"][ids] = self.target[ids][:, self.graph.acting]
             # whose arms are where they are sent
             self.carries["carry_base_posture"][ids] = torch.where(
                 self.graph.acts > 0, self.target[ids], _tensor(self.clips.stances[self.clips.skill[self.clip[ids]]])
             )
-            self.carries["carry_base_skill"][ids, self.graph.base.labels.index("walk")] = 1.0
             low, high = self.graph.base.config.command_low, self.graph.base.config.command_high
             some = rng.random((k, 1)) > self.config.still
             self.command[ids] = _tensor(rng.uniform(low, high, (k, 3)) * some)
+            told = self.command[ids] * (self.skill[ids] @ self.graph.walks)
+            self.carries["carry_base_skill"][ids] = self.graph.gait(told)
         self._lost[ids] = 0
         back = conjugate(qpos[:, 3:7])
         self._seen[ids, :3] = rotate(back, qpos[:, BALL] - qpos[:, :3])

@@ -40,6 +40,8 @@ class PolicyGraph(nn.Module):
     acts: Tensor
     poses: Tensor
     walks: Tensor
+    ahead: Tensor
+    gaits: Tensor
     spread: Tensor
     lower: Tensor
     upper: Tensor
@@ -75,6 +77,9 @@ class PolicyGraph(nn.Module):
                 self.clips.plan(k, self.acting, PULL * (name in config.timed)) for k, name in enumerate(self.labels)
             ]
             self.plan = Plan(rows, corrections(config.corrections, self.labels, len(self.acting)))
+            self.register_buffer("ahead", torch.eye(2, 3))  # forwards and left, to a command
+            labels = list(self.base.labels)
+            self.register_buffer("gaits", torch.eye(len(labels))[[labels.index("walk"), labels.index("stand")]])
             self.register_buffer("spread", _buffer(np.eye(len(acts))[self.acting]))  # arms to joints
         self.register_buffer("poses", _buffer(self.clips.stances - robot.home_pos))  # (skills, n), of the base
         self.register_buffer("walks", _buffer(np.array([[skill in config.walks] for skill in config.skills])))
@@ -95,6 +100,12 @@ class PolicyGraph(nn.Module):
         target = signals.rest + action @ self.drive
         return torch.minimum(torch.maximum(target, self.lower), self.upper)
 
+    def gait(self, command: Tensor) -> Tensor:
+        """What the base does (N, its labels), one-hot: it walks where ``command`` (N, 3) is not zero, and else keeps its feet
+        where they are; told to walk on the spot, it would drift towards a ball that it holds."""
+        moves = (command.abs().sum(dim=-1, keepdim=True) > 0).to(command.dtype)
+        return moves * self.gaits[0] + (1 - moves) * self.gaits[1]
+
     def remember(self, signals: Signals) -> Tensor:
         """The history (N, size) that the next tick sees."""
         size = self.history // self.config.history
@@ -106,9 +117,9 @@ class PolicyGraph(nn.Module):
 
     def carry_start(self) -> dict[str, list[float]]:
         """What each carried tensor is before the first tick; an empty list is zeros."""
-        names = [n for n in self.inputs() if n.startswith("carry_")]
-        start = torch.where(self.acts > 0, self.postures[0], _buffer(self.clips.stances[0])).tolist()
-        return {n: start if n == "carry_base_posture" else [] for n in names}
+        start = torch.where(self.acts > 0, self.postures[0], _buffer(self.clips.stances[0]))
+        known = {"carry_base_posture": start.tolist(), "carry_arms": start[self.acting].tolist()}
+        return {n: known.get(n, []) for n in self.inputs() if n.startswith("carry_")}
 
     def inputs(self) -> dict[str, list[int]]:
         """Every input by name with its shape, without the batch axis, in the order of ``forward``."""
@@ -125,7 +136,11 @@ class PolicyGraph(nn.Module):
             "object_velocity_in_base": [3],
             "carry_action": [len(self.acting)],
             "carry_history": [self.history],
-            **({} if self.base is None else {"carry_skill": [len(self.labels)], "carry_clock": [1]}),
+            **(
+                {}
+                if self.base is None
+                else {"carry_skill": [len(self.labels)], "carry_clock": [1], "carry_arms": [len(self.acting)]}
+            ),
             **{_of_base(name): shape for name, shape in base.items() if name.startswith("carry_")},
         }
 
@@ -154,20 +169,18 @@ class PolicyGraph(nn.Module):
             ankle = config.balance_gain * (gravity[:, 0:1] - skill @ self.lean) + config.balance_damping * gyro[:, 1:2]
             rest = posture + self.ankles * ankle
         else:
-            plan = self.plan(skill, inputs["carry_skill"], inputs["carry_clock"], ball)
+            plan = self.plan(skill, inputs["carry_skill"], inputs["carry_clock"], inputs["carry_arms"], ball)
             planned = torch.cat([plan.ball_error, plan.clock / self.plan.longest], dim=-1)
             posture = plan.target @ self.spread
             # The base sees the arms on their way to where they were last sent.
             hands = self.acts * (posture - self.base.home) + inputs["carry_action"] @ self.drive
             pose = skill @ self.poses * (1 - self.acts) + hands
-            walk = torch.zeros(len(skill), len(self.base.labels))
-            walk[:, self.base.labels.index("walk")] = 1.0
-            command = inputs["command_velocity"] * (skill @ self.walks)
+            command = inputs["command_velocity"] * (skill @ self.walks) + plan.pace @ self.ahead
             given = {n.replace("carry_base", "carry"): v for n, v in inputs.items() if n.startswith("carry_base_")}
-            seen = self.base.advance(*joints, orientation, gyro, command, walk, **given, pose=pose)
+            seen = self.base.advance(*joints, orientation, gyro, command, self.gait(command), **given, pose=pose)
             action = self.base.clip(self.base.actor(observe_base(seen)))
             rest = torch.where(self.acts > 0, posture, self.base.target(seen, action))
-            carried = {"carry_skill": skill + 0.0, "carry_clock": plan.clock}
+            carried = {"carry_skill": skill + 0.0, "carry_clock": plan.clock, "carry_arms": plan.target}
             carried |= {_of_base(name): value for name, value in self.base.carries(seen, action).items()}
         return Signals(*joints, gravity, gyro, skill, inputs["object_position_in_base"],
                        inputs["object_velocity_in_base"], rest, planned, inputs["carry_action"],

@@ -23,16 +23,20 @@ from sim2real.types import Sim2realError
 ROOT = Path(__file__).resolve().parents[2]
 GRAVITY = 9.81  # m/s^2
 KNOTS = 8  # of a skill that moves
-REACH = 0.12  # m, the furthest that palms follow the ball
+REACH, TIP, PACE = 0.12, 0.5, 0.4  # m, rad, m/s: the furthest that palms and base follow the ball
 SLOW = 0.5  # m/s: a ball slower than this says little about the time
+# rad a tick: how fast targets go to where a skill begins. Arms that are thrown there throw the robot off its feet.
+APPROACH, AT_ONCE = 0.04, 10.0
 
 
 class Correction(NamedTuple):
     """What was optimised, of one skill."""
 
     offsets: np.ndarray  # (KNOTS, arms) rad, added to targets; all alike for a skill that holds still
-    follow: np.ndarray  # (3,) m of the palms per m of the ball: forwards, left, up
-    damp: np.ndarray  # (3,) m per m/s
+    # Of the palms, per m that the ball is off: m forwards, left and up; and rad that they tip forwards, with how far it is
+    # ahead, so that they push it back. Of the base: m/s forwards and left.
+    follow: np.ndarray  # (6,)
+    damp: np.ndarray  # (6,) the same per m/s
 
 
 @dataclass
@@ -42,7 +46,8 @@ class Rows:
     target: np.ndarray  # (T, arms) rad
     ball: np.ndarray  # (T, 3) m in the base
     velocity: np.ndarray  # (T, 3) m/s
-    back: np.ndarray  # (T, arms, 3) rad of the arms whose palms have business with the ball, per m that they move
+    # rad of the arms whose palms have business with the ball, per m that they move, and per rad that they tip
+    back: np.ndarray  # (T, arms, 4)
     loop: bool
     pull: np.ndarray  # (T,) rows a tick per s that the ball is ahead, of a clock that follows it; 0: it runs by itself
     knots: np.ndarray = field(init=False)  # (T, KNOTS) shares of the knots in each row
@@ -62,6 +67,7 @@ class Planned(NamedTuple):
     target: Tensor  # (N, arms) rad
     clock: Tensor  # (N, 1) rows since the skill's beginning
     ball_error: Tensor  # (N, 6) m and m/s from where the plan has the ball
+    pace: Tensor  # (N, 2) m/s forwards and left, of the base, beside what it is told
 
 
 class Plan(nn.Module):
@@ -77,6 +83,7 @@ class Plan(nn.Module):
     bounce: Tensor
     offsets: Tensor
     follow: Tensor
+    reach: Tensor
 
     def __init__(self, rows: Sequence[Rows], corrections: Sequence[Correction]) -> None:
         super().__init__()
@@ -99,15 +106,18 @@ class Plan(nn.Module):
         self.register_buffer("loop", _buffer([[r.loop] for r in rows]))
         self.register_buffer("offsets", _buffer(np.stack([c.offsets for c in corrections])))
         self.register_buffer("follow", _buffer(np.stack([np.concatenate([c.follow, c.damp]) for c in corrections])))
+        self.register_buffer("reach", _buffer([REACH] * 3 + [TIP] + [PACE] * 2))
 
     def corrections(self, skill: Tensor) -> tuple[Tensor, Tensor]:
-        """Offsets (N, KNOTS, arms) and gains (N, 6) of each robot's skill (N, labels)."""
+        """Offsets (N, KNOTS, arms) and gains (N, 12) of each robot's skill (N, labels)."""
         offsets = skill @ self.offsets.flatten(1)  # a matrix product: the runtime knows no einsum
         return offsets.unflatten(1, self.offsets.shape[1:]), skill @ self.follow
 
-    def forward(self, skill: Tensor, last_skill: Tensor, last_clock: Tensor, ball: Tensor) -> Planned:
-        """``skill`` (N, labels) one-hot, and that of the tick before with its clock (N, 1); ``ball`` (N, 6) m and m/s in
-        the base."""
+    def forward(
+        self, skill: Tensor, last_skill: Tensor, last_clock: Tensor, last_target: Tensor, ball: Tensor
+    ) -> Planned:
+        """``skill`` (N, labels) one-hot, and that of the tick before with its clock (N, 1) and targets (N, arms); ``ball``
+        (N, 6) m and m/s in the base."""
         same = (skill * last_skill).sum(dim=-1, keepdim=True)
         last, loop = skill @ self.last, skill @ self.loop
         clock, rate = self._step(skill, same * last_clock, same, last, loop, ball)
@@ -119,12 +129,17 @@ class Plan(nn.Module):
         planned = mixed(self.table)
         error = ball - planned[:, self.arms : self.arms + 6]
         offsets, gains = self.corrections(skill)
-        moved = error * gains
+        place, speed = error[:, :3], error[:, 3:]
+        reads = [place, place[:, :1], place[:, :2], speed, speed[:, :1], speed[:, :2]]
+        moved = torch.cat(reads, dim=-1) * gains
         waits = (rate <= 0) & (same > 0) & (loop == 0)  # for a ball that is still somewhere else
-        palm = torch.where(waits, 0.0, torch.clamp(moved[:, :3] + moved[:, 3:], -REACH, REACH))
+        wanted = moved[:, :6] + moved[:, 6:]
+        wanted = torch.where(waits, 0.0, torch.minimum(torch.maximum(wanted, -self.reach), self.reach))
         target = planned[:, : self.arms] + (mixed(self.knots)[:, :, None] * offsets).sum(dim=1)
-        target = target + (self.back[row] * palm[:, None]).sum(dim=-1)
-        return Planned(target, clock, error)
+        target = target + (self.back[row] * wanted[:, None, :4]).sum(dim=-1)
+        step = torch.where(clock < 1, APPROACH, AT_ONCE)
+        target = last_target + torch.minimum(torch.maximum(target - last_target, -step), step)
+        return Planned(target, clock, error, wanted[:, 4:])
 
     def _step(
         self, skill: Tensor, clock: Tensor, same: Tensor, last: Tensor, loop: Tensor, ball: Tensor
@@ -159,12 +174,12 @@ def read(file: str | Path | None, skills: Sequence[str], arms: int) -> list[Corr
     known = document(file)
     found = []
     for skill in skills:
-        entry = known.get(skill, {"offsets": [[0.0] * arms], "follow": [0.0] * 3, "damp": [0.0] * 3})
+        entry = known.get(skill, {"offsets": [[0.0] * arms], "follow": [0.0] * 6, "damp": [0.0] * 6})
         offsets, follow, damp = (np.array(entry[k], float) for k in ("offsets", "follow", "damp"))
-        if offsets.shape not in ((1, arms), (KNOTS, arms)) or follow.shape != (3,) or damp.shape != (3,):
+        if offsets.shape not in ((1, arms), (KNOTS, arms)) or follow.shape != (6,) or damp.shape != (6,):
             raise Sim2realError(
                 f"{file}: '{skill}': got offsets {offsets.shape}, follow {follow.shape}, damp {damp.shape}, expected"
-                f" (1 or {KNOTS}, {arms}), (3,), (3,): optimise it again (policies/skillmimic/optimise.py)"
+                f" (1 or {KNOTS}, {arms}), (6,), (6,): optimise it again (policies/skillmimic/optimise.py)"
             )
         found.append(Correction(np.broadcast_to(offsets, (KNOTS, arms)), follow, damp))
     return found
