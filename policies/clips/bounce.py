@@ -1,9 +1,10 @@
 """A dribble by formula: no recording shows a ball bounced in place, so this one is physics.
 
 A stroke begins where the ball stands still, at its peak: a palm on top of it pushes it down with one constant
-acceleration, leaves it, and is back when the ball is, which has bounced with its restitution. So the stroke repeats
-exactly, and palm and ball meet with no speed between them. The arm follows by inverse kinematics; on its way back the
-palm follows a cubic. Liu & Hodgins (2018), too, needed no recorded ball.
+acceleration, leaves it, comes to rest, and is back when the ball is, which has bounced with its restitution. So the
+stroke repeats exactly, and palm and ball meet with no speed between them. The arm follows by inverse kinematics, which
+hardly minds how the hand is turned: a hand kept level swings a heavy shoulder, and that shakes the robot off its feet.
+On its way back the palm follows a cubic. Liu & Hodgins (2018), too, needed no recorded ball.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ GRAVITY = 9.81  # m/s^2
 SOLVER = "daqp"
 CLEAR = 0.015  # m between palm and ball while they do not touch
 SMOOTHING = 0.5  # frames
+TURNED = 0.03  # m/rad: what a turned hand counts beside one that is elsewhere
+TICK = 0.02  # s of a policy: a stroke lasts some of them
 SETTLING = 3  # strokes before the one that is kept: then inverse kinematics has forgotten where it began
 
 
@@ -33,8 +36,8 @@ class Stroke:
     """One bounce, at the size of the robot."""
 
     peak: float = 0.86  # m, the ball's centre where the palm finds it
-    push: float = 0.2  # m that the palm stays on it
-    follow: float = 0.1  # m that the palm goes on after it
+    push: float = 0.15  # m that the palm stays on it
+    follow: float = 0.12  # m in which the palm then comes to rest
     place: tuple[float, float] = (0.2, 0.3)  # m from the base: ahead, and to the side of the arm
     knees: float = 0.9  # rad, bent: brings the hand down
 
@@ -81,19 +84,22 @@ def path(stroke: Stroke, radius: float, t: np.ndarray) -> tuple[np.ndarray, np.n
     z = np.select([on, falls], [stroke.peak - pull * s**2 / 2, leave - k.release * f - GRAVITY * f**2 / 2],
                   stroke.peak - GRAVITY * left**2 / 2)  # fmt: skip
     v = np.select([on, falls], [-pull * s, -k.release - GRAVITY * f], GRAVITY * left)
-    fly = k.fall + k.rise
-    u = f / fly  # Hermite: from the release, at its speed, to rest at the peak
-    back = leave + stroke.push * (3 * u**2 - 2 * u**3) - k.release * fly * (u**3 - 2 * u**2 + u)
-    above = np.maximum.reduce(
-        [back, np.full_like(back, leave - stroke.follow), z + np.minimum(CLEAR, GRAVITY * left**2 / 4)]
+    stop = 2 * stroke.follow / k.release  # s in which the palm comes to rest
+    low = leave - stroke.follow
+    u = np.clip((f - stop) / (k.fall + k.rise - stop), 0, 1)  # and back, from rest to rest
+    back = np.where(
+        f < stop,
+        leave - k.release * f + k.release**2 / (4 * stroke.follow) * f**2,
+        low + (stroke.peak - low) * (3 * u**2 - 2 * u**3),
     )
+    above = np.maximum.reduce([back, z + np.minimum(CLEAR, GRAVITY * left**2 / 4)])
     return z, v, np.where(on, z, above), on
 
 
-def dribble(body: RobotBody, name: str, stroke: Stroke = Stroke(), side: str = "right", fps: float = 50.0) -> Clip:
+def dribble(body: RobotBody, name: str, stroke: Stroke = Stroke(), side: str = "right", fps: float = 100.0) -> Clip:
     """One stroke of ``side``'s hand, from peak to peak, by a robot that stands with bent knees."""
     sign = 1.0 if side == "left" else -1.0
-    frames = round(times(stroke, ball.RADIUS).period * fps)
+    frames = round(round(times(stroke, ball.RADIUS).period / TICK) * TICK * fps)
     stroke = lasting(stroke, ball.RADIUS, frames / fps)
     period = frames / fps
     t = np.arange(frames * (SETTLING + 2)) * period / frames
@@ -117,7 +123,7 @@ def dribble(body: RobotBody, name: str, stroke: Stroke = Stroke(), side: str = "
     mine = np.array([j.group == "arm" and side in j.name for j in body.robot.joints])
     still = np.ones(model.nv, bool)
     still[body.qvel_at[mine]] = False
-    reach = mink.FrameTask(f"{side}_palm", "site", 1.0, 0.15)
+    reach = mink.FrameTask(f"{side}_palm", "site", 1.0, TURNED)
     posture = mink.PostureTask(model, 3e-2)
     posture.set_target(q)
     freeze = mink.DofFreezingTask(model, np.flatnonzero(still).tolist())

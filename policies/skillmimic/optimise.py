@@ -26,7 +26,7 @@ from policies.skillmimic.config import TASKS, SkillMimic
 from policies.skillmimic.env import Env
 from policies.skillmimic.evaluate import ticks_of
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.plan import KNOTS, ROOT, Correction
+from policies.skillmimic.plan import KNOTS, REACH, ROOT, Correction
 from policies.skillmimic.randomisation import TABLE
 
 with warnings.catch_warnings():  # that there is no matplotlib
@@ -60,14 +60,14 @@ class Search:
         """(..., KNOTS, arms) rad of vectors (..., size)."""
         arms = len(self.free)
         own = np.zeros((*x.shape[:-1], self.count, arms))
-        own[..., self.free] = x[..., :-12].reshape(*x.shape[:-1], self.count, -1) * OFFSET
+        own[..., self.free] = x[..., : -2 * len(REACH)].reshape(*x.shape[:-1], self.count, -1) * OFFSET
         if self.both:
             own = own + own[..., self.order] * self.sign
         return np.broadcast_to(own, (*x.shape[:-1], KNOTS, arms))
 
     def gains(self, x: np.ndarray) -> np.ndarray:
         """(..., 12) of vectors (..., size)."""
-        return x[..., -12:] * np.concatenate([GAIN, DAMP])
+        return x[..., -2 * len(REACH) :] * np.concatenate([GAIN, DAMP])
 
     def correction(self, x: np.ndarray) -> Correction:
         return Correction(self.offsets(x)[: self.count], *np.split(self.gains(x), 2))

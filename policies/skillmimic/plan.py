@@ -23,7 +23,8 @@ from sim2real.types import Sim2realError
 ROOT = Path(__file__).resolve().parents[2]
 GRAVITY = 9.81  # m/s^2
 KNOTS = 8  # of a skill that moves
-REACH, TIP, PACE = 0.12, 0.5, 0.4  # m, rad, m/s: the furthest that palms and base follow the ball
+# The furthest that palms and base follow the ball: m forwards, left, up; rad tipped forwards; m/s forwards, left.
+REACH = np.array([0.15, 0.15, 0.15, 0.5, 0.4, 0.4])
 SLOW = 0.5  # m/s: a ball slower than this says little about the time
 # rad a tick: how fast targets go to where a skill begins. Arms that are thrown there throw the robot off its feet.
 APPROACH, AT_ONCE = 0.04, 10.0
@@ -33,8 +34,8 @@ class Correction(NamedTuple):
     """What was optimised, of one skill."""
 
     offsets: np.ndarray  # (KNOTS, arms) rad, added to targets; all alike for a skill that holds still
-    # Of the palms, per m that the ball is off: m forwards, left and up; and rad that they tip forwards, with how far it is
-    # ahead, so that they push it back. Of the base: m/s forwards and left.
+    # What is in REACH per m that the ball is off: palms go after it, and tip with how far it is ahead, so that they push
+    # it back; and so does the base.
     follow: np.ndarray  # (6,)
     damp: np.ndarray  # (6,) the same per m/s
 
@@ -106,7 +107,7 @@ class Plan(nn.Module):
         self.register_buffer("loop", _buffer([[r.loop] for r in rows]))
         self.register_buffer("offsets", _buffer(np.stack([c.offsets for c in corrections])))
         self.register_buffer("follow", _buffer(np.stack([np.concatenate([c.follow, c.damp]) for c in corrections])))
-        self.register_buffer("reach", _buffer([REACH] * 3 + [TIP] + [PACE] * 2))
+        self.register_buffer("reach", _buffer(REACH))
 
     def corrections(self, skill: Tensor) -> tuple[Tensor, Tensor]:
         """Offsets (N, KNOTS, arms) and gains (N, 12) of each robot's skill (N, labels)."""
@@ -174,12 +175,12 @@ def read(file: str | Path | None, skills: Sequence[str], arms: int) -> list[Corr
     known = document(file)
     found = []
     for skill in skills:
-        entry = known.get(skill, {"offsets": [[0.0] * arms], "follow": [0.0] * 6, "damp": [0.0] * 6})
+        entry = known.get(skill, {"offsets": [[0.0] * arms], "follow": 0 * REACH, "damp": 0 * REACH})
         offsets, follow, damp = (np.array(entry[k], float) for k in ("offsets", "follow", "damp"))
-        if offsets.shape not in ((1, arms), (KNOTS, arms)) or follow.shape != (6,) or damp.shape != (6,):
+        if offsets.shape not in ((1, arms), (KNOTS, arms)) or follow.shape != REACH.shape or damp.shape != REACH.shape:
             raise Sim2realError(
                 f"{file}: '{skill}': got offsets {offsets.shape}, follow {follow.shape}, damp {damp.shape}, expected"
-                f" (1 or {KNOTS}, {arms}), (6,), (6,): optimise it again (policies/skillmimic/optimise.py)"
+                f" (1 or {KNOTS}, {arms}), {REACH.shape}, {REACH.shape}: optimise it again (policies/skillmimic/optimise.py)"
             )
         found.append(Correction(np.broadcast_to(offsets, (KNOTS, arms)), follow, damp))
     return found

@@ -17,31 +17,37 @@ from policies.skillmimic.config import TASKS
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PULL, PolicyGraph
 from policies.skillmimic.optimise import Search, optimise, score, write
-from policies.skillmimic.plan import KNOTS, REACH, Correction, Plan, Rows, read, samples
+from policies.skillmimic.plan import APPROACH, KNOTS, REACH, Correction, Plan, Rows, read, samples
 from sim2real.types import Sim2realError
 
 ARMS, T = 2, 8
-THREE = [0.0, 0.0, 0.0]
+NONE = [0.0] * len(REACH)
+
+
+def axis(up: float, tip: float = 0.0, pace: float = 0.0) -> list[float]:
+    """Gains of what moves up, of the tipping, and of the base's pace forwards."""
+    return [0.0, 0.0, up, tip, pace, 0.0]
 
 
 def rows(loop: bool = False, pull: float = 0.0) -> Rows:
     """A ball that flies forwards at 1 m/s, 2 cm a row, and one joint that follows the row's number."""
     t = np.arange(T)
     ball = np.column_stack([t * 0.02, np.zeros(T), np.zeros(T)])
-    back = np.zeros((T, ARMS, 3))
+    back = np.zeros((T, ARMS, 4))
     back[:, 1, 2] = 2.0  # a metre up is two radians of the second joint
+    back[:, 0, 3] = 1.0  # the first one tips the palm
     return Rows(
         np.column_stack([t * 0.1, np.zeros(T)]), ball, np.tile([1.0, 0, 0], (T, 1)), back, loop, np.full(T, pull)
     )
 
 
-def correction(offset: float = 0.0, follow: list[float] = THREE, damp: list[float] = THREE) -> Correction:
+def correction(offset: float = 0.0, follow: list[float] = NONE, damp: list[float] = NONE) -> Correction:
     return Correction(np.tile([offset, 0.0], (KNOTS, 1)), np.array(follow), np.array(damp))
 
 
-def at(plan: Plan, clock: float, ball: list[float], skill: int = 0, before: int = 0):
-    one = torch.eye(len(plan.first))
-    return plan(one[[skill]], one[[before]], torch.tensor([[clock]]), torch.tensor([ball], dtype=torch.float32))
+def at(plan: Plan, clock: float, ball: list[float], skill: int = 0, before: int = 0, target: float = 0.0):
+    one, last = torch.eye(len(plan.first)), torch.full((1, ARMS), target)
+    return plan(one[[skill]], one[[before]], torch.tensor([[clock]]), last, torch.tensor([ball], dtype=torch.float32))
 
 
 def where(row: float) -> list[float]:
@@ -99,14 +105,29 @@ def test_offsets_are_spread_over_the_rows_by_their_knots():
 
 
 def test_palms_follow_a_ball_that_is_elsewhere_as_far_as_they_reach():
-    plan = Plan([rows()], [correction(follow=[0.0, 0.0, 0.5], damp=[0.0, 0.0, 0.1])])
+    plan = Plan([rows()], [correction(follow=axis(0.5), damp=axis(0.1))])
     off = [0.08, 0.0, 0.04, 1.0, 0.0, 0.2]  # 4 cm up, and on its way at 0.2 m/s
     np.testing.assert_allclose(at(plan, 3.0, off).target, [[0.4, 2.0 * (0.5 * 0.04 + 0.1 * 0.2)]], atol=1e-6)
-    np.testing.assert_allclose(at(plan, 3.0, [0, 0, 9, 1, 0, 0]).target, [[0.4, 2.0 * REACH]], atol=1e-6)
+    np.testing.assert_allclose(at(plan, 3.0, [0, 0, 9, 1, 0, 0]).target, [[0.4, 2.0 * REACH[2]]], atol=1e-6)
+
+
+def test_palms_tip_and_the_base_follows_a_ball_that_runs_ahead():
+    plan = Plan([rows()], [correction(follow=axis(0.0, tip=2.0, pace=3.0), damp=axis(0.0, pace=1.0))])
+    p = at(plan, 3.0, [0.08 + 0.05, 0.0, 0.0, 1.1, 0.0, 0.0])
+    np.testing.assert_allclose(p.target, [[0.4 + 2.0 * 0.05, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(p.pace, [[3.0 * 0.05 + 0.1, 0.0]], atol=1e-6)
+
+
+def test_arms_come_slowly_to_where_a_skill_begins_and_follow_it_at_once_from_there():
+    plan = Plan([rows(), rows()], [correction()] * 2)
+    begin = at(plan, 5.0, where(0), skill=1, before=0, target=1.0)
+    np.testing.assert_allclose(begin.target, [[1.0 - APPROACH, 1.0 - APPROACH]], atol=1e-6)
+    then = at(plan, 0.0, where(1), skill=1, before=1, target=1.0)
+    np.testing.assert_allclose(then.target, [[0.1, 0.0]], atol=1e-6)
 
 
 def test_palms_do_not_follow_a_ball_that_the_plan_still_waits_for():
-    plan = Plan([rows(pull=PULL)], [correction(follow=[0.0, 0.0, 0.5])])
+    plan = Plan([rows(pull=PULL)], [correction(follow=axis(0.5))])
     coming = [-5.0, 0.0, 0.1, 1.0, 0.0, 0.0]
     p = at(plan, 3.0, coming)
     assert float(p.clock) == 3.0
@@ -115,7 +136,7 @@ def test_palms_do_not_follow_a_ball_that_the_plan_still_waits_for():
 
 def test_what_was_found_is_read_back(tmp_path):
     path = tmp_path / "plan.yaml"
-    some = Correction(np.round(np.random.default_rng(0).normal(size=(KNOTS, ARMS)), 4), np.ones(3), np.zeros(3))
+    some = Correction(np.round(np.random.default_rng(0).normal(size=(KNOTS, ARMS)), 4), np.ones(6), np.zeros(6))
     write(path, "catch", some, 10)
     write(path, "catch", some, 5)
     write(path, "pass", correction())
@@ -141,7 +162,7 @@ def test_both_arms_are_corrected_alike_but_for_a_dribble(graph):
     names = [graph.joint_names[j] for j in graph.acting]
     for label in graph.labels:
         search = Search(graph, graph.labels.index(label))
-        size = search.count * int(search.free.sum()) + 6
+        size = search.count * int(search.free.sum()) + 2 * len(REACH)
         c = search.correction(np.arange(1.0, size + 1))
         moved = {names[k].partition("_")[0] for k in np.flatnonzero(np.abs(c.offsets).max(axis=0))}
         assert moved == ({"right"} if label == "dribble_in_place" else {"left", "right"})
@@ -155,18 +176,18 @@ def test_a_candidate_that_drops_the_ball_scores_less(graph):
     search = Search(one, 0)
     still = search.vector(Correction(one.plan.offsets[0].numpy(), *np.split(one.plan.follow[0].numpy(), 2)))
     apart = still.copy()
-    apart[:-6] += np.where([n.endswith("shoulder_roll_joint") for n in one.joint_names if n.startswith("left_")
+    apart[: -2 * len(REACH)] += np.where([n.endswith("shoulder_roll_joint") for n in one.joint_names if n.startswith("left_")
                             and any(p in n for p in ("shoulder", "elbow", "wrist"))], 6.0, 0.0)  # fmt: skip
     values = score(Env(config, 0, one), np.stack([still, apart]), search, 40)
     assert values[0] > 1.2 and values[1] < 0.6
 
 
-def test_a_search_keeps_what_it_has_found_after_every_generation(monkeypatch, capsys):
-    monkeypatch.setattr("policies.skillmimic.optimise.SECONDS", 0.2)
+def test_a_search_keeps_what_it_has_found_after_every_generation(capsys):
     config = dataclasses.replace(TASKS["g1-ball"], clips=("hold_01",), threads=1)
     found: list[Correction] = []
     cost: list[int] = []
-    optimise(config, "hold", 2, candidates=4, each=2, keep=lambda c, n: (found.append(c), cost.append(n)))
+    optimise(config, "hold", 2, candidates=4, each=2, keep=lambda c, n: (found.append(c), cost.append(n)),
+             seconds=0.2)  # fmt: skip
     assert cost == [10 * 8] * 2  # 0.2 s of eight robots
     assert len(found) == 2 and found[0].offsets.shape == (1, 14)
     assert np.abs(found[1].offsets - found[0].offsets).max() > 0
