@@ -19,6 +19,7 @@ from policies.skillmimic.world import training_world
 from policies.train import graph_of
 from sim2real.config import RobotConfig, load_robot
 
+WALKS = 0.05  # m/s or rad/s: what is slower is stood
 PULL = 12.0  # rows of the plan, per tick, per s that the ball is ahead of it
 
 
@@ -101,9 +102,9 @@ class PolicyGraph(nn.Module):
         return torch.minimum(torch.maximum(target, self.lower), self.upper)
 
     def gait(self, command: Tensor) -> Tensor:
-        """What the base does (N, its labels), one-hot: it walks where ``command`` (N, 3) is not zero, and else keeps its feet
+        """What the base does (N, its labels), one-hot: it walks where ``command`` (N, 3) says so, and else keeps its feet
         where they are; told to walk on the spot, it would drift towards a ball that it holds."""
-        moves = (command.abs().sum(dim=-1, keepdim=True) > 0).to(command.dtype)
+        moves = (command.abs().amax(dim=-1, keepdim=True) > WALKS).to(command.dtype)
         return moves * self.gaits[0] + (1 - moves) * self.gaits[1]
 
     def remember(self, signals: Signals) -> Tensor:

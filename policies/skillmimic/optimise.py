@@ -55,6 +55,9 @@ class Search:
         side = "left" if both or graph.clips.hands[clip, 0] else "right"
         self.free = np.array([name.startswith(side) for name in names])
         self.both = both
+        # A base that goes after the ball walks and never stands: only where the ball comes back again and again.
+        chases = bool(graph.clips.loop[clip])
+        self.unit = np.concatenate([unit * np.repeat([1.0, chases], [4, 2]) for unit in (GAIN, DAMP)])
 
     def offsets(self, x: np.ndarray) -> np.ndarray:
         """(..., KNOTS, arms) rad of vectors (..., size)."""
@@ -67,7 +70,7 @@ class Search:
 
     def gains(self, x: np.ndarray) -> np.ndarray:
         """(..., 12) of vectors (..., size)."""
-        return x[..., -2 * len(REACH) :] * np.concatenate([GAIN, DAMP])
+        return x[..., -2 * len(REACH) :] * self.unit
 
     def correction(self, x: np.ndarray) -> Correction:
         return Correction(self.offsets(x)[: self.count], *np.split(self.gains(x), 2))

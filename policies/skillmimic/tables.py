@@ -16,6 +16,7 @@ from policies.graph import one_hot
 from policies.skillmimic.env import Env
 from policies.skillmimic.evaluate import Trace, episodes_of, evaluate_skill, succeeded, ticks_of, traced
 from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.starts import aiming
 
 # The paper's factors of Table 2. Of its restitutions those above 1.2 are left out: 1.25 x 0.80 is a ball that never stops.
 SWEEPS: dict[str, tuple[float, ...]] = {
@@ -80,12 +81,13 @@ def switched(graph: PolicyGraph, first: str, second: str, episodes: int, act: Ac
     nexts = env.rng.choice(np.flatnonzero(clips.skill == graph.labels.index(second)), episodes)
     ticks = np.array([ticks_of(graph, clip, SECOND) for clip in nexts])
     rest = np.where(clips.swing[env.clip] | clips.loop[env.clip], np.inf, clips.length[env.clip])  # rows
+    waited = aiming(graph, int(env.clip[0]))
     began, ended = np.full((2, episodes), -1)
     lost, up = np.zeros(episodes, bool), np.full(episodes, True)
     rows: list[Trace] = []
     with torch.no_grad():
         while not (lost | (ended >= 0)).all():
-            late = env.since >= FIRST / config.timestep
+            late = len(rows) * config.period >= FIRST + waited
             due = (began < 0) & ~lost & (late | (env.since - rest >= REST / config.timestep))
             if due.any():
                 began[due] = len(rows)

@@ -106,9 +106,9 @@ def test_a_film_shows_the_first_good_run(graph, file, tmp_path, monkeypatch):
 def test_an_episode_is_as_long_as_in_training(graph):
     clips = graph.clips
     length = (clips.length[CATCH] - 1) * CONFIG.timestep + CONFIG.after
-    assert ticks_of(graph, CATCH, 10.0) == pytest.approx(length / CONFIG.period, abs=1)
+    assert ticks_of(graph, CATCH, 10.0) == pytest.approx((AIMING + length) / CONFIG.period, abs=1)
     assert ticks_of(graph, HOLD, 10.0) == 500  # it swings
-    assert ticks_of(graph, CATCH, 1.0) == 50
+    assert ticks_of(graph, CATCH, 1.0) == pytest.approx((AIMING + 1.0) / CONFIG.period, abs=1)
 
 
 def test_only_walking_skills_are_told_a_velocity(graph):

@@ -10,12 +10,14 @@ import pytest
 import torch
 
 from policies import ball
-from policies.skillmimic.config import SkillMimic
+from policies.skillmimic.config import TASKS, SkillMimic
 from policies.skillmimic.env import BALL, JOINTS, Env
 from policies.skillmimic.evaluate import evaluate, measure
 from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.starts import thrown
 from policies.skillmimic.terminations import TERMINATIONS
 from sim2real.contract import CARRY, INPUTS
+from sim2real.object.scene import AIMING
 
 CONFIG = SkillMimic(envs=8, threads=1, disturbed=0.0, push_chance=0.0)
 MIXED = dataclasses.replace(CONFIG, skills=("hold", "pass", "pickup"), clips=())
@@ -262,3 +264,49 @@ def test_evaluation_counts_episodes_and_frames(graph):
     assert zero.success.survived == 4 and zero.accuracy > 0.9 and zero.ball_error < 0.03
     wild = evaluate(graph, episodes=4, seconds=2.0, act=lambda env: still(env) + 6.0)["hold"]
     assert wild.success.survived == 0 and wild.accuracy < zero.accuracy
+
+
+# a ball that is thrown
+
+CATCH = dataclasses.replace(TASKS["g1-ball"], skills=("catch",), clips=("catch_06",), envs=6, threads=1, disturbed=0.0,
+                            push_chance=0.0, throw=0.0, anywhere=False)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def catches():
+    return PolicyGraph(CATCH)
+
+
+def ball_from_below_base(env: Env) -> np.ndarray:
+    """(envs, 3) m, seen from the floor below a base that has hardly turned."""
+    return env._qpos[:, BALL] - env._qpos[:, :3] * [1.0, 1.0, 0.0]
+
+
+def test_a_thrown_ball_is_aimed_in_front_of_the_base_and_then_flies_as_in_its_clip(catches):
+    env, (place, velocity) = Env(CATCH, 1, catches), thrown(catches, 0)
+    env.episode_length_buf[:] = 0
+    waits = round(AIMING / CATCH.period)
+    for tick in range(waits - 1):
+        env.step(still(env))
+        assert not env.failures.any() and (env.since <= 0).all(), tick
+        assert (env.carries["carry_clock"] < 5).all()  # the arms wait
+        np.testing.assert_allclose(np.linalg.norm(ball_from_below_base(env), axis=1), np.linalg.norm(place), atol=0.05)
+    assert (env.since == 0).all()
+    env.step(still(env))
+    speed = env._qvel[:, -6:-3]
+    np.testing.assert_allclose(np.linalg.norm(speed[:, :2], axis=1), np.linalg.norm(velocity[:2]), atol=0.02)
+    np.testing.assert_allclose(speed[:, 2], velocity[2] - 9.81 * CATCH.period, atol=0.02)
+
+
+def test_in_training_half_of_those_who_are_thrown_a_ball_wait_for_it(catches):
+    config = dataclasses.replace(CATCH, anywhere=True, envs=400)
+    env = Env(config, 1, catches)
+    waits = env._aims > 0
+    assert 0.4 < waits.mean() < 0.6 and (env.row[waits] == 0).all() and env.row[~waits].max() > 0
+    assert env._aims.max() == round(AIMING / config.period)
+
+
+def test_a_base_that_is_told_nothing_keeps_its_feet_on_the_floor(catches):
+    labels = list(catches.base.labels)
+    told = torch.tensor([[0.0, 0.0, 0.0], [0.04, 0.0, -0.04], [0.0, 0.3, 0.0]])
+    assert [labels[k] for k in catches.gait(told).argmax(dim=1)] == ["stand", "stand", "walk"]
