@@ -23,6 +23,7 @@ from policies.evaluate import (
     switch_script,
 )
 from policies.randomisation import TABLE
+from policies.spread import spread
 from policies.through_bytes import deploy_episode, stayed_up
 from sim2real.contract import Contract
 from sim2real.policy import load_policy
@@ -105,10 +106,10 @@ def evaluate(path: Path, config: Basics, episodes: int, deployed: int, tell: Tel
     runs = {}
     for push in (0.0, PUSH):
         tell(f"{deployed} runs through the bytes" + (", pushed" if push else ""))
-        runs[push] = [
-            deploy_episode(path, config, steps(row, labels, config.period), push, seed=k)
-            for k, row in enumerate(random_script(config, len(labels), deployed, SECONDS, EVERY, seed=5))
-        ]
+        rows = random_script(config, len(labels), deployed, SECONDS, EVERY, seed=5)
+        runs[push] = spread(
+            deploy_episode, [(path, config, steps(r, labels, config.period), push, k) for k, r in enumerate(rows)]
+        )
     summaries = [summary for row in runs.values() for summary in row]
     closest = min(summaries, key=lambda s: s.joint_margin)
     survived = {push: Rate(sum(stayed_up(s, SECONDS) for s in row), len(row)) for push, row in runs.items()}

@@ -17,7 +17,8 @@ from policies.skillmimic.evaluate import BALL_NEAR, BODY_NEAR, Result, evaluate_
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.release import graph_of
 from policies.skillmimic.tables import FIRST, NOMINAL, REST, SECOND, sweeps, switches
-from policies.skillmimic.through_bytes import BEFORE, deploy_episode
+from policies.skillmimic.through_bytes import BEFORE, judged
+from policies.spread import spread
 from sim2real.contract import Contract
 from sim2real.object.camera import CameraModel
 from sim2real.policy import load_policy
@@ -109,11 +110,9 @@ def through_bytes(
     for k, label in enumerate(graph.labels):
         tell(f"{label}: {episodes} runs through the bytes, the ball {'seen by a camera' if camera else 'known'}")
         clips = np.flatnonzero(graph.clips.skill == k)
-        runs = [
-            deploy_episode(path, graph, int(clips[i % len(clips)]), SECONDS, camera, seed=i) for i in range(episodes)
-        ]
-        good = np.array([r.success for r in runs])
-        results[label] = result(good, np.stack([r.sums for r in runs]), np.array([max(r.frames, 1) for r in runs]))
+        runs = spread(judged, [(path, int(clips[i % len(clips)]), SECONDS, camera, i) for i in range(episodes)])
+        good, sums, frames = (np.array(column) for column in zip(*runs, strict=True))
+        results[label] = result(good, sums, np.maximum(frames, 1))
     return results
 
 

@@ -35,6 +35,8 @@ with warnings.catch_warnings():  # that there is no matplotlib
 
 # What is one unit of the search: rad; m, rad, m/s per m; the same per m/s.
 OFFSET, GAIN, DAMP = 0.1, np.repeat([0.4, 0.8, 1.0], [3, 1, 2]), np.repeat([0.04, 0.3, 0.3], [3, 1, 2])
+SIGMA = 0.3  # of the first generation, in those units
+QUIET = 1.3  # strokes without a touch, after which a ball is not being dribbled
 
 
 class Search:
@@ -106,7 +108,8 @@ class Alike(np.random.Generator):
 
 
 def score(env: Env, candidates: np.ndarray, search: Search, ticks: int) -> np.ndarray:
-    """(candidates,): mean reward of a tick, 0 after a failure, plus half the share of ticks before one.
+    """(candidates,): mean reward of a tick, 0 after a failure, plus half the share of ticks before one; of a ball that
+    bounces, of those ticks in which it was touched less than ``QUIET`` of its strokes ago.
 
     ``env`` has as many robots for each candidate as for another, in turn.
     """
@@ -118,12 +121,14 @@ def score(env: Env, candidates: np.ndarray, search: Search, ticks: int) -> np.nd
     env.reset()
     env.episode_length_buf[:] = 0
     idle: Tensor = torch.zeros(env.num_envs, env.num_actions)
-    alive, total = np.full(env.num_envs, True), np.zeros(env.num_envs)
+    alive, total, quiet = np.full(env.num_envs, True), np.zeros(env.num_envs), np.zeros(env.num_envs)
+    longest = QUIET * np.where(env.clips.loop, env.clips.length, np.inf)[env.clip] / env.substeps  # ticks
     with torch.no_grad():
         for _ in range(ticks):
             _, rewards, _, _ = env.step(idle)
             alive &= ~env.failures
-            total += alive * (rewards.numpy() + 0.5)
+            quiet = np.where(env.now.state.contact[:, 0] > 0, 0, quiet + 1)
+            total += alive * (rewards.numpy() + 0.5 * (quiet < longest))
     return (total / ticks).reshape(each, len(candidates)).mean(axis=0)
 
 
@@ -153,7 +158,7 @@ def optimise(
     search = Search(graph, 0)
     start = search.vector(plan.read(config.corrections, [skill], len(graph.acting))[0])
     options = {"popsize": candidates - 1, "seed": seed + 1, "verbose": -9, "CMA_diagonal": 15}
-    es = cma.CMAEvolutionStrategy(start, 0.3, options)
+    es = cma.CMAEvolutionStrategy(start, SIGMA, options)
     began = time.monotonic()
     for generation in range(1, generations + 1):
         asked = es.ask()

@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 GRAVITY = 9.81  # m/s^2
 KNOTS = 8  # of a skill that moves
 # The furthest that palms and base follow the ball: m forwards, left, up; rad tipped forwards; m/s forwards, left.
-REACH = np.array([0.15, 0.15, 0.15, 0.5, 0.4, 0.4])
+REACH = np.array([0.15, 0.15, 0.25, 0.5, 0.4, 0.4])
 SLOW = 0.5  # m/s: a ball slower than this says little about the time
 # rad a tick: how fast targets go to where a skill begins. Arms that are thrown there throw the robot off its feet.
 APPROACH, AT_ONCE = 0.04, 10.0

@@ -7,6 +7,7 @@ from its soft start, or from the skill before, and not from the clip's first fra
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +20,7 @@ from policies.clips.robot import POINT_NAMES
 from policies.skillmimic.evaluate import Measures, Trace, measure, succeeded, ticks_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.randomisation import TABLE
-from policies.skillmimic.release import NONE
+from policies.skillmimic.release import NONE, graph_of
 from policies.skillmimic.rewards import Motion, Step
 from policies.skillmimic.stance import Place, arms, moved
 from policies.skillmimic.starts import object_start
@@ -28,6 +29,7 @@ from policies.through_bytes import deployed, random_body
 from sim2real.contract import ObjectStart
 from sim2real.object.camera import CameraModel
 from sim2real.object.scene import Handover
+from sim2real.policy import load_policy
 from sim2real.simulation import Scene, Simulation
 
 BEFORE = 2.0  # s of the policy's first skill before another one begins
@@ -222,6 +224,19 @@ def deploy_episode(
     summary = simulation.run()
     judge.failed |= bool(summary.faults) or judge.frames < ticks
     return judge
+
+
+def judged(
+    path: Path, clip: int, seconds: float, camera: CameraModel | None, seed: int
+) -> tuple[float, np.ndarray, int]:
+    """Success, sums of Measures (4,) and frames of a ``deploy_episode`` of a policy file."""
+    judge = deploy_episode(path, _graph(path), clip, seconds, camera, seed)
+    return judge.success, judge.sums, judge.frames
+
+
+@functools.lru_cache(maxsize=1)
+def _graph(path: Path) -> PolicyGraph:
+    return graph_of(load_policy(path, trial=0).contract)
 
 
 def command(graph: PolicyGraph, label: str, rng: np.random.Generator) -> tuple[float, float, float]:
