@@ -36,6 +36,7 @@ class SkillMimic:
     )
     hidden: tuple[int, ...] = (256, 128)
     action_ratio: float = 0.25  # action 1 moves the target by this share of torque / kp
+    legs: float = 0.0  # of legs and waist that a base moves, the share that the actor adds to what that says
     action_max: float = 6.0
     grip: float = (
         30.0  # N each palm presses, where the clip has both on the ball: inside the posture actions start from

@@ -213,8 +213,8 @@ class Env(VecEnv):
         if self.graph.base is not None:
             trunk, stance = (self._bodies[:, self._trunk], self._turns[:, self._trunk]), self.clips.skill[self.clip]
             there = self.clips.trunk_position[stance], self.clips.trunk_orientation[stance]
-            state = arms(moved(state, qvel, trunk, there), self.graph.acting)
-            acceleration = acceleration[:, self.graph.acting]
+            state = arms(moved(state, qvel, trunk, there), self.graph.arms)
+            acceleration = acceleration[:, self.graph.arms]
         away = lambda there, here: np.where(gone[:, None], here, there)  # noqa: E731
         reference = reference._replace(
             object_position=away(reference.object_position, state.object_position),
@@ -226,7 +226,7 @@ class Env(VecEnv):
     def reference(self, rows: np.ndarray, way: np.ndarray) -> Motion:
         """What is imitated at table ``rows`` (N,), as ``_judge`` sees states."""
         motion = self.clips.motion(rows, way)
-        return motion if self.graph.base is None else arms(motion, self.graph.acting)
+        return motion if self.graph.base is None else arms(motion, self.graph.arms)
 
     def _observe(self) -> None:
         """Measure every robot; what its actor sees this tick, and what only the critic sees."""
@@ -356,7 +356,7 @@ class Env(VecEnv):
             self.carries["carry_clock"][ids] = _tensor(
                 np.where(self.clips.swing[clip], 0.0, self.row[ids] / self.substeps)[:, None]
             )
-            self.carries["carry_arms"][ids] = self.target[ids][:, self.graph.acting]
+            self.carries["carry_arms"][ids] = self.target[ids][:, self.graph.arms]
             # whose arms are where they are sent
             self.carries["carry_base_posture"][ids] = torch.where(
                 self.graph.acts > 0, self.target[ids], _tensor(self.clips.stances[self.clips.skill[self.clip[ids]]])

@@ -50,7 +50,7 @@ class Search:
         clip = int(np.flatnonzero(graph.clips.skill == skill)[0])
         still = bool(graph.clips.swing[clip])
         self.count = 1 if still else KNOTS
-        names = [graph.joint_names[j] for j in graph.acting]
+        names = [graph.joint_names[j] for j in graph.arms]
         self.order, sign = joint_mirror(names)
         self.sign = np.array(sign)
         both = bool(graph.clips.hands[clip].all())
@@ -156,7 +156,7 @@ def optimise(
     env.rng = Alike(seed, each, candidates)
     env.random.table = TABLE | {name: TABLE[name]._replace(low=a, high=b) for name, (a, b) in (ranges or {}).items()}
     search = Search(graph, 0)
-    start = search.vector(plan.read(config.corrections, [skill], len(graph.acting))[0])
+    start = search.vector(plan.read(config.corrections, [skill], len(graph.arms))[0])
     options = {"popsize": candidates - 1, "seed": seed + 1, "verbose": -9, "CMA_diagonal": 15}
     es = cma.CMAEvolutionStrategy(start, SIGMA, options)
     began = time.monotonic()

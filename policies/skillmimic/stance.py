@@ -69,7 +69,7 @@ def stand(clip: Clip, body: RobotBody, pose: np.ndarray, height: float) -> Clip:
 
 
 def arms(m: Motion, acting: Sequence[int]) -> Motion:
-    """All of ``m`` that an actor can help who moves nothing but the arms: the joints ``acting``, by index."""
+    """All of ``m`` that arms can help, the joints ``acting``, by index."""
     points, level = m.points[:, 1 + ARM_POINTS], np.tile(LEVEL, (len(m.points), 1))
     return Motion(points, np.zeros_like(points), level, m.joint_pos[:, acting], m.joint_vel[:, acting],
                   m.object_position, m.object_velocity, m.contact)  # fmt: skip
