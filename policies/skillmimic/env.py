@@ -14,6 +14,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
+from policies import ball
 from policies.clips.kinematics import conjugate, multiply, quaternion_from_rotation_vector, rotate
 from policies.clips.robot import POINT_NAMES, RobotBody
 from policies.env import POSITION_STEP, VELOCITY_STEP
@@ -273,7 +274,21 @@ class Env(VecEnv):
         sees = self._lost == 0
         self._seen[sees] = np.concatenate([position, velocity], axis=1)[sees]
         self._lost[~sees] -= 1
+        self._foretell(np.flatnonzero(~sees))
         return self._seen
+
+    def _foretell(self, ids: np.ndarray) -> None:
+        """What a tracker says of balls that it does not see: they go on as they went, or fly and bounce."""
+        period, seen = self.config.period, self._seen[ids]
+        flies = ~self.contacts.touching(self._recorded["sensordata"][ids, -1:])[:, 0, 0]
+        seen[:, :3] += period * seen[:, 3:]
+        seen[:, 2] -= flies * GRAVITY * period**2 / 2
+        seen[:, 5] -= flies * GRAVITY * period
+        floor = ball.RADIUS - self._qpos[ids, 2]
+        bounces = (seen[:, 2] < floor) & (seen[:, 5] < 0)
+        seen[:, 5] *= np.where(bounces, -ball.RESTITUTION, 1.0)
+        seen[:, 2] = np.maximum(seen[:, 2], floor)
+        self._seen[ids] = seen
 
     def _truth(self) -> np.ndarray:
         """(envs, size): what the critic may know beside the actor's observation; about 1 in size."""
@@ -282,13 +297,13 @@ class Env(VecEnv):
         reference = self.clips.motion(rows, way)
         back = conjugate(qpos[:, 3:7])
         turn = multiply(back, reference.orientation_base_in_world)
-        ball = rotate(back, qpos[:, BALL] - qpos[:, :3])
+        here = rotate(back, qpos[:, BALL] - qpos[:, :3])
         if self.graph.base is None:
             place = rotate(back, reference.points[:, 0] - qpos[:, :3])
             miss = rotate(back, reference.object_position - qpos[:, BALL])
         else:  # where the base has got to is not this actor's business
             place, turn = np.zeros((len(back), 3)), turn * [[1.0, 1.0, 1.0, 0.0]]
-            miss = reference.object_position - reference.points[:, 0] - ball
+            miss = reference.object_position - reference.points[:, 0] - here
         ahead = self.episode_length_buf.numpy()[:, None] / self.max_episode_length
         left = (self.clips.length[self.clip] - self.row)[:, None] / 200.0
         columns = [
@@ -297,7 +312,7 @@ class Env(VecEnv):
             turn[:, 1:] * np.where(turn[:, :1] < 0, -4, 4),
             (reference.joint_pos - qpos[:, JOINTS]) * 2,
             reference.joint_vel * 0.3,
-            ball * 4,
+            here * 4,
             rotate(back, qvel[:, FLIGHT] - qvel[:, :3]) * 0.5,
             miss * 4,
             rotate(back, reference.object_velocity) * 0.5,

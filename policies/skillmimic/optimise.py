@@ -57,9 +57,9 @@ class Search:
         side = "left" if both or graph.clips.hands[clip, 0] else "right"
         self.free = np.array([name.startswith(side) for name in names])
         self.both = both
-        # A base that goes after the ball walks and never stands: only where the ball comes back again and again.
+        # Palms tip, and the base walks, only after a ball that comes back again and again.
         chases = bool(graph.clips.loop[clip])
-        self.unit = np.concatenate([unit * np.repeat([1.0, chases], [4, 2]) for unit in (GAIN, DAMP)])
+        self.unit = np.concatenate([unit * np.repeat([1.0, chases], [3, 3]) for unit in (GAIN, DAMP)])
 
     def offsets(self, x: np.ndarray) -> np.ndarray:
         """(..., KNOTS, arms) rad of vectors (..., size)."""

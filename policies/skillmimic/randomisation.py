@@ -75,8 +75,10 @@ TABLE: dict[str, Term] = {
     "object_offset": Term(-0.01, 0.01, 3, "m: calibration of camera or markers to the base"),
     "object_noise": Term(0.0, 0.008, 1, "m, standard deviation of the position"),
     "object_velocity_noise": Term(0.0, 0.2, 1, "m/s, standard deviation: it is differentiated"),
-    "object_delay": Term(0.0, 4.0, 1, "substeps of 5 ms (whole ones): prediction never makes good all of a delay"),
-    "object_loss": Term(0.0, 0.05, 1, "chance a tick that the ball is lost from sight; the last answer is repeated"),
+    "object_delay": Term(
+        0.0, 3.0, 1, "substeps of 5 ms (whole ones): what prediction leaves; a flight is seen 1 to 2 ms late, 8 at most"
+    ),
+    "object_loss": Term(0.0, 0.05, 1, "chance a tick that the ball is lost from sight; its course is foretold then"),
 }
 LOSS_TICKS = (1, 8)  # how long it stays lost
 

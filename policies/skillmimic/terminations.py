@@ -9,8 +9,8 @@ import numpy as np
 from policies.skillmimic.rewards import Step
 
 # m between ball and its reference, seen from the first key point, while the reference has it in hand; of a ball that
-# bounces, at any time and over the floor
-BALL_LOST = 0.3
+# bounces, at any time and over the floor: after that one the robot can still go
+BALL_LOST, BALL_GONE = 0.3, 0.5
 FALLEN = 0.3  # m: the base; the retargeted pickup bends down to 0.48
 
 
@@ -23,7 +23,8 @@ def up(orientation_base_in_world: np.ndarray) -> np.ndarray:
 def _ball_lost(s: Step) -> np.ndarray:
     here, there = (m.object_position - m.points[:, 0] for m in (s.state, s.reference))
     away = (here - there) * np.where(s.bounces[:, None], [1.0, 1.0, 0.0], 1.0)
-    return (s.bounces | (s.reference.contact[:, 0] > 0)) & (np.linalg.norm(away, axis=1) > BALL_LOST)
+    limit = np.where(s.bounces, BALL_GONE, BALL_LOST)
+    return (s.bounces | (s.reference.contact[:, 0] > 0)) & (np.linalg.norm(away, axis=1) > limit)
 
 
 TERMINATIONS: dict[str, Callable[[Step], np.ndarray]] = {
