@@ -243,7 +243,7 @@ class Launch:
                 if hanging:
                     hanging = support(self.world, self.stage, self._engage_left(now), self.since)
                 if self.handover is not None:
-                    self.handover.act(self.stage, self.skill, self._engage_left(now), self.since)
+                    self.handover.act(self.stage, self.skill, self._engage_left(now), self.since, wish.skill)
                 self.measures.observe(self.world, self.states.record, self.pilot_states.record, self.since)
             self.measures.tick(self.states.record)
             self._listen()

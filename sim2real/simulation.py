@@ -133,16 +133,16 @@ class Simulation:
             if running is None and stage == Stage.RUN:
                 running = now
             self.since = now - running if running is not None else -1.0
+            wish = self.operator.read(now, self.since)
             if hanging:
                 hanging = support(world, stage, self.player.engage_left(now), self.since)
             if self.handover is not None:
                 label = self.player.labels[self.player.skill]
-                self.handover.act(stage, label, self.player.engage_left(now), self.since)
+                self.handover.act(stage, label, self.player.engage_left(now), self.since, wish.skill)
             if self.camera is not None:
                 self.camera.watch(world)
             while pushes and 0 <= pushes[0][0] <= self.since:
                 world.push(pushes.pop(0)[1])
-            wish = self.operator.read(now, self.since)
             if self.player.object_age > self.player.object_patience:
                 wish = replace(wish, arm=False)  # whoever arms looks first whether it sees its ball
             store(wish, self.player.labels, self._operator_record)

@@ -142,7 +142,7 @@ class SkillPlayer:
             self._from[:] = state.joint_pos
         if self.stage == Stage.ENGAGE and now - self._engaged >= self.engage_time:
             self.stage = Stage.RUN
-            self._begin(now)
+            self._begin()
         self.command.object_time = now - self.object_age
         if self.stage == Stage.STANDBY:
             self._standby(state)
@@ -170,9 +170,9 @@ class SkillPlayer:
         c.kp[:] = gain * plan.kp
         c.kd[:] = self.config.damping + gain * (plan.kd - self.config.damping)
 
-    def _begin(self, now: float) -> None:
+    def _begin(self) -> None:
         self.policies[self.policy_index].reset()
-        self._since = now
+        self._since = -np.inf  # what it begins with nobody chose: the operator's first wish need not wait
 
     def _run(self, state: RobotState, operator: OperatorInput, now: float) -> bool:
         """Let the policy decide. Returns whether it could."""

@@ -21,6 +21,7 @@ from policies.skillmimic.through_bytes import BEFORE, judged
 from policies.spread import spread
 from sim2real.contract import Contract
 from sim2real.object.camera import CameraModel
+from sim2real.object.scene import AIMING
 from sim2real.policy import load_policy
 
 SECONDS = 10.0  # of an episode; that of a skill that ends by itself ends with its clip
@@ -160,8 +161,9 @@ the bytes, bodies and balls. A ball that is thrown flies up to {throw:g} m/s oth
 
 {verdicts}
 
-Through the bytes a skill begins from its soft start, or from {BEFORE:g} s of `{contract.default_skill}`, and not from its clip's
-first frame. A simulated person hands the ball over, or throws it as in the clip.
+Through the bytes a skill begins from the soft start, or, with the ball in the hands, from {BEFORE:g} s of
+`{contract.default_skill}`, and not from its clip's first frame. A simulated person hands the ball over, or aims for {AIMING:g} s and throws
+it as in the clip; so they do in the training environment.
 {table_2(e)}{table_3(e)}{learning(curve, pictures)}"""
 
 

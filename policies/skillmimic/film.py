@@ -10,6 +10,7 @@ import numpy as np
 from drivers.sim.camera import Camera
 from policies.skillmimic.evaluate import ticks_of
 from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.starts import object_start
 from policies.skillmimic.through_bytes import BEFORE, deploy_episode
 from sim2real.object.camera import CameraModel
 from sim2real.simulation import Simulation
@@ -25,7 +26,8 @@ def film(path: Path, graph: PolicyGraph, label: str, gif: Path) -> int:
     """Write ``gif`` of a skill of a policy file, robot and ball drawn at random and the ball seen by a camera. Returns which
     run it shows, from 1; 0: none was good, it shows the last."""
     clips = np.flatnonzero(graph.clips.skill == graph.labels.index(label))
-    skill = 0.0 if label == graph.labels[0] else BEFORE  # s: when it begins
+    in_hands = label != graph.labels[0] and object_start(graph, int(clips[0]))["how"] == "held"
+    skill = BEFORE if in_hands else 0.0  # s: when it begins
 
     def run(seed: int, watch: Callable[[Simulation], None] = lambda simulation: None) -> bool:
         clip = int(clips[seed % len(clips)])

@@ -32,7 +32,7 @@ from sim2real.object.scene import Handover
 from sim2real.policy import load_policy
 from sim2real.simulation import Scene, Simulation
 
-BEFORE = 2.0  # s of the policy's first skill before another one begins
+BEFORE = 2.0  # s of the policy's first skill before another one that needs the ball in the hands
 AFTER = 0.1  # s that a run goes on after what is judged
 
 
@@ -206,8 +206,10 @@ def deploy_episode(
     rng = np.random.default_rng([seed, clip])
     config, ticks = graph.config, ticks_of(graph, clip, seconds)
     label, first = graph.labels[graph.clips.skill[clip]], graph.labels[0]
-    steps = [] if label == first else [(first, BEFORE)]
-    steps.append((label, ticks * config.period + AFTER))
+    starts = {n: ObjectStart.model_validate(object_start(graph, clip if n == label else 0)) for n in {first, label}}
+    # Else somebody has the ball, and the arms come from the soft start.
+    in_hands = label != first and starts[label].how == "held"
+    steps = [(first, BEFORE)] * in_hands + [(label, ticks * config.period + AFTER)]
     judge = Judge(graph, clip, ticks)
 
     def each_tick(simulation: Simulation) -> None:
@@ -216,7 +218,6 @@ def deploy_episode(
 
     scene = Scene(seed=seed, prepare=random_body(rng), camera=camera, ball=random_ball(rng))
     simulation = deployed(path, steps, scene, [NONE] * (len(steps) - 1) + [command(graph, label, rng)], each_tick)
-    starts = {n: ObjectStart.model_validate(object_start(graph, clip if n == label else 0)) for n in {first, label}}
     if starts[label].how == "thrown":
         flight = starts[label].velocity + rng.uniform(-config.throw, config.throw, 3)
         starts[label] = starts[label].model_copy(update={"velocity": tuple(flight.tolist())})

@@ -24,6 +24,7 @@ AWAY = 0.4  # m in front of its place: where a ball waits that will be put into 
 COMING, BROUGHT = 0.6, 1.4  # s that bringing it takes, s before the end of the soft start at which it is there
 HANDING_OVER = 0.3  # s for which a ball in the robot's hands is held on to
 CLOSING = 0.8  # s for which it is where the hands come from elsewhere, of a robot that may have walked
+HEEDING = 0.1  # s in which a policy that took over heeds its operator's first wish
 AIMING = 1.6  # s for which it is where it will be thrown from, while the arms go where they wait for it
 REACH = 0.4  # m: a ball farther from its place is not in the robot's hands any more
 
@@ -36,8 +37,11 @@ class Handover:
         self._skill = ""  # that the ball was last brought for
         self._let_go = np.inf  # s since the policy took over
 
-    def act(self, stage: Stage, skill: str, left: float, since: float) -> None:
-        """``left``: s until the soft start ends; ``since``: s since the policy took over, negative before."""
+    def act(self, stage: Stage, skill: str, left: float, since: float, wish: str | None = None) -> None:
+        """``left``: s until the soft start ends; ``since``: s since the policy took over, negative before. At first the ball
+        is brought for what the operator ``wish``es to begin with."""
+        if since < HEEDING and wish:
+            skill = wish
         if since > self._let_go:
             self._release(self._starts[self._skill])
             self._let_go = np.inf

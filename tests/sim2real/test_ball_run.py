@@ -163,6 +163,16 @@ def test_a_ball_is_aimed_and_then_thrown_for_every_skill_that_catches(world):
         world.advance(world.time + 0.3)
 
 
+def test_the_ball_is_brought_for_what_the_operator_wishes_to_begin_with(world):
+    thrown = ObjectStart(how="thrown", position=(1.5, 0.0, 1.0), velocity=(-3.0, 0.0, 2.0))
+    handover = Handover(world, {"hold": ObjectStart(how="held", position=(0.5, 0.0, 0.1)), "catch": thrown})
+    for left, since in ((1.0, -1.0), (0.0, 0.0), (0.0, 0.04)):  # the policy is still at its first label
+        handover.act(Stage.ENGAGE if since < 0 else Stage.RUN, "hold", left, since, "catch")
+        assert place(world)[0] == pytest.approx(1.5, abs=0.05)
+    handover.act(Stage.RUN, "hold", 0.0, 1.0, "catch")  # it will not
+    assert place(world)[0] == pytest.approx(0.5, abs=0.05)
+
+
 def test_a_ball_without_speed_is_dropped_at_once(world):
     handover = Handover(world, {"dribble": ObjectStart(how="thrown", position=(0.3, -0.3, 1.0))})
     handover.act(Stage.RUN, "dribble", -1.0, 0.0)

@@ -90,21 +90,23 @@ def skills(*rows):
 
 
 def test_switches_obey_transitions_and_dwell(robot, policy_of):
-    rows = skills(("a", {"next": ["b"], "dwell": 0.5}), ("b", {}), ("c", {}))
+    rows = skills(("a", {"next": ["b"], "dwell": 0.5}), ("b", {"next": ["a"], "dwell": 0.5}), ("c", {}))
     player, state = SkillPlayer(robot, [policy_of(**rows)]), standing(robot)
     now = to_run(player, state)
+    player.step(state, Mode.RUN, wish(now, "b"), now)  # nobody chose what it began with
+    assert player.labels[player.skill] == "b" and not player.refusals
     for _ in range(5):  # asked five times, refused and told once
-        player.step(state, Mode.RUN, wish(now, "b"), now)
+        player.step(state, Mode.RUN, wish(now, "a"), now)
         now += TICK
-    assert player.labels[player.skill] == "a"
-    assert [r.skill for r in player.refusals] == ["b"] and "0.5 s" in player.refusals[0].reason
+    assert player.labels[player.skill] == "b"
+    assert [r.skill for r in player.refusals] == ["a"] and "0.5 s" in player.refusals[0].reason
     now += 0.5
     player.step(state, Mode.RUN, wish(now, "c"), now)
-    assert "may only be followed by b" in player.refusals[-1].reason
-    player.step(state, Mode.RUN, wish(now, "b"), now)
-    assert player.labels[player.skill] == "b"
+    assert "may only be followed by a" in player.refusals[-1].reason
+    player.step(state, Mode.RUN, wish(now, "a"), now)
+    assert player.labels[player.skill] == "a"
     player.step(state, Mode.RUN, wish(now, "nonsense"), now)
-    assert "unknown label" in player.refusals[-1].reason and player.labels[player.skill] == "b"
+    assert "unknown label" in player.refusals[-1].reason and player.labels[player.skill] == "a"
 
 
 VALUED = tiny_policy.TEXT.replace("carry_count_next) {{", "carry_count_next, float[1,2] skill_value) {{").replace(
