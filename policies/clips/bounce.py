@@ -38,7 +38,7 @@ class Stroke:
     peak: float = 0.88  # m, the ball's centre where the palm finds it
     push: float = 0.15  # m that the palm stays on it
     follow: float = 0.12  # m in which the palm then comes to rest
-    place: tuple[float, float] = (0.2, 0.3)  # m from the base: ahead, and to the side of the arm
+    place: tuple[float, float] = (0.27, 0.3)  # m from the base: ahead, and to the side of the arm
     knees: float = 0.35  # rad, bent: as the robot stands at home
 
 
