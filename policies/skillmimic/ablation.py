@@ -1,8 +1,8 @@
 """The paper's Table 1 on one skill: what the contact graph and the product of rewards are worth, at equal samples.
 
-``python -m policies.skillmimic.ablation g1-ball dribble_in_place`` trains every variant of ``rewards.VARIANTS`` with several
-seeds, all over the same plan, and prints success over episodes that no training has seen. What is trained already is not
-trained again. The paper learns without a plan: here rewards decide only about what is learned on top.
+``python -m policies.skillmimic.ablation g1-ball hold`` trains every variant of ``rewards.VARIANTS`` with several seeds and
+prints success over episodes that no training has seen. What is trained already is not trained again. The paper's policies
+find out by themselves that a ball is to be pressed; so do these: the plan is the bare clip, without corrections and grip.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ def config_of(task: str, skill: str, variant: str, seed: int, samples: float) ->
         config,
         skills=(skill,),
         clips=clips,
+        corrections=None,
+        grip=0.0,
         variant=variant,
         sensitivity=variant if variant in SENSITIVITIES else config.sensitivity,
         seed=seed,

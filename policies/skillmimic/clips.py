@@ -37,7 +37,8 @@ class ReferenceClips:
     """Every clip of ``config.skills``, end to end.
 
     ``first`` and ``length`` (clips,): rows of each; ``skill`` (clips,) its label's index; ``swing`` (clips,) whether it
-    plays to and fro, ``loop`` whether over and over. ``qpos`` (rows, 7 + n + 7), ``qvel`` (rows, 6 + n + 6) and ``target`` (rows, n) start an episode.
+    plays to and fro, ``loop`` whether over and over. ``qpos`` (rows, 7 + n + 7), ``qvel`` (rows, 6 + n + 6) and ``target``
+    (rows, n) start an episode.
     """
 
     def __init__(
@@ -88,6 +89,7 @@ class ReferenceClips:
         m = self._motion
         count = len(press)
         joints = m.joint_pos + press
+        self.press = press / PRESS  # (rows, n) rad per m that both palms go towards the ball
         upright = np.tile([1.0, 0, 0, 0], (count, 1))
         self.qpos = np.concatenate([m.points[:, 0], m.orientation_base_in_world, joints, m.object_position, upright], 1)
         spin = np.concatenate([c.base_angular_velocity_in_base for c in fine])

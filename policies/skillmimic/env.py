@@ -348,6 +348,8 @@ class Env(VecEnv):
         self.since[ids] = self.row[ids] - self.substeps * np.maximum(self._aims[ids] - 1, 0)
         rows, _ = self.clips.rows(self.clip[ids], self.row[ids])
         qpos, qvel, target = self.clips.qpos[rows].copy(), self.clips.qvel[rows].copy(), self.clips.target[rows].copy()
+        swollen = ball.RADIUS * (self.random.drawn["ball_radius"][ids] - 1)  # m; hands lie on the ball that there is
+        qpos[:, JOINTS] -= self.clips.press[rows] * swollen
         flies = self.clips.motion(rows, np.ones(k)).contact[:, :1] == 0
         self._miss[ids] = flies * rng.uniform(-self.config.throw, self.config.throw, (k, 3))
         qvel[:, FLIGHT] += self._miss[ids]

@@ -138,7 +138,7 @@ class Plan(nn.Module):
         wanted = torch.where(waits, 0.0, torch.minimum(torch.maximum(wanted, -self.reach), self.reach))
         target = planned[:, : self.arms] + (mixed(self.knots)[:, :, None] * offsets).sum(dim=1)
         target = target + (self.back[row] * wanted[:, None, :4]).sum(dim=-1)
-        step = torch.where(clock < 1, APPROACH, AT_ONCE)
+        step = torch.where((clock < 1) & (loop == 0), APPROACH, AT_ONCE)
         target = last_target + torch.minimum(torch.maximum(target - last_target, -step), step)
         return Planned(target, clock, error, wanted[:, 4:])
 

@@ -20,7 +20,7 @@ def result(survived: int) -> Result:
 @pytest.mark.parametrize("variant", list(VARIANTS))
 def test_variants_differ_in_their_reward_alone(variant):
     config = ablation.config_of("g1-ball", "catch", variant, 2, 1e5)
-    assert config.clips == ("catch_06",) and config.samples == 1e5
+    assert config.clips == ("catch_06",) and config.corrections is None and config.grip == 0 and config.samples == 1e5
     assert config.variant == variant and config.seed == 2
     assert config.sensitivity == ("deepmimic" if variant == "deepmimic" else TASKS["g1-ball"].sensitivity)
 

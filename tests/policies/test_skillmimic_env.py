@@ -310,3 +310,22 @@ def test_a_base_that_is_told_nothing_keeps_its_feet_on_the_floor(catches):
     labels = list(catches.base.labels)
     told = torch.tensor([[0.0, 0.0, 0.0], [0.04, 0.0, -0.04], [0.0, 0.3, 0.0]])
     assert [labels[k] for k in catches.gait(told).argmax(dim=1)] == ["stand", "stand", "walk"]
+
+
+def test_an_actor_that_helps_the_legs_adds_to_what_the_base_says():
+    graph = PolicyGraph(dataclasses.replace(CATCH, legs=0.1))
+    env = Env(graph.config, 1, graph)
+    assert env.num_actions == len(graph.joint_names) and len(graph.arms) == 14
+    knee, elbow = (graph.joint_names.index(f"left_{n}_joint") for n in ("knee", "elbow"))
+    action = torch.zeros(1, env.num_actions)
+    action[0, graph.acting.index(knee)] = action[0, graph.acting.index(elbow)] = 1.0
+    one = {name: value[:1] for name, value in (*env.inputs.items(), *env.carries.items())}
+    seen = graph.signals(**one)
+    moved = (graph.target(seen, action) - graph.target(seen, 0 * action))[0]
+    for joint, share in ((knee, 0.1), (elbow, graph.config.action_ratio)):
+        limit = graph.robot.torque_max[joint] / graph.kp[joint]
+        assert float(moved[joint]) == pytest.approx(share * limit, rel=1e-4)
+    assert int((moved.abs() > 1e-6).sum()) == 2
+    with_help = graph.signals(**(one | {"carry_action": action}))  # the base hears of the arms alone: it feels its legs
+    pose = with_help.carried["carry_base_posture"] - seen.carried["carry_base_posture"]
+    assert float(pose[0, elbow].abs()) > 0 and float(pose[0, knee]) == pytest.approx(0.0, abs=1e-6)
