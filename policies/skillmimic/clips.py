@@ -22,6 +22,7 @@ from policies.skillmimic.stance import crouched, stand, trunk
 from policies.skillmimic.world import hands
 
 SINGULAR = 0.08  # m/rad: damps the way back from palms to joints where an arm is stretched
+LATE = 0.02  # s, on average, until a target acts: it is held for a tick, and travels
 LEVER = 0.3  # m: of palms, a rad counts as this far
 PRESS = 0.004  # m the palms start inside the ball, so that they carry it from the first step on
 
@@ -97,7 +98,7 @@ class ReferenceClips:
             [m.points_velocity[:, 0], spin, m.joint_vel, m.object_velocity, np.zeros((count, 3))], axis=1
         )
         self.target = joints + effort
-        self._lag = body.robot.home_kd / kp  # s that a motor's damping keeps it behind its target
+        self._lag = body.robot.home_kd / kp + LATE  # s that a motor is behind its target, by its damping and by its bus
 
     def sample(self, rng: np.random.Generator, k: int, skills: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
         """(k,) clips and (k,) rows into them: every skill (of ``skills``, by index) as often, then every clip of it, then
