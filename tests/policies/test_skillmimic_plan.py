@@ -159,7 +159,7 @@ def graph():
 
 
 def test_both_arms_are_corrected_alike_but_for_a_dribble(graph):
-    names = [graph.joint_names[j] for j in graph.acting]
+    names = [graph.joint_names[j] for j in graph.arms]
     for label in graph.labels:
         search = Search(graph, graph.labels.index(label))
         size = search.count * int(search.free.sum()) + 2 * len(REACH)
@@ -167,7 +167,10 @@ def test_both_arms_are_corrected_alike_but_for_a_dribble(graph):
         moved = {names[k].partition("_")[0] for k in np.flatnonzero(np.abs(c.offsets).max(axis=0))}
         assert moved == ({"right"} if label == "dribble_in_place" else {"left", "right"})
         assert search.count == (1 if label in graph.config.swing else KNOTS)
-        np.testing.assert_allclose(search.vector(c), np.arange(1.0, size + 1), atol=1e-9)
+        expected = np.arange(1.0, size + 1)
+        if label != "dribble_in_place":  # palms tip, and the base walks, only after a ball that comes again and again
+            expected[-9:-6] = expected[-3:] = 0.0
+        np.testing.assert_allclose(search.vector(c), expected, atol=1e-9)
 
 
 def test_a_candidate_that_drops_the_ball_scores_less(graph):
