@@ -24,6 +24,12 @@ from policies.skillmimic.rewards import SENSITIVITIES, VARIANTS
 from policies.skillmimic.train import SkillTraining, load_graph
 
 FOLDER = Path("runs/ablation")
+HEAD = "What the contact graph and the product of rewards are worth"
+NOTE = """Written by `python -m policies.skillmimic.ablation`; do not edit. The paper's Table 1: one skill, one reward each
+(equations of its appendix B.1), the same samples, networks and settings. The plan under the policy is the bare clip: no
+corrections, and nothing presses the ball, so that this has to be learned. Success as in the policy's card, over 10 s, with
+95 % confidence: of the pooled episodes (Wilson), and of the mean over seeds (Student's t), which is the one to compare
+variants by. Acc., E_o and E_cg as in the paper's section 6.2."""
 
 
 def config_of(task: str, skill: str, variant: str, seed: int, samples: float) -> SkillMimic:
@@ -85,6 +91,7 @@ def main() -> None:
     parser.add_argument("--samples", type=float, default=0.3e6)
     parser.add_argument("--seeds", type=int, choices=range(2, 6), default=3)
     parser.add_argument("--episodes", type=int, default=100, help="of each seed")
+    parser.add_argument("--report", type=Path, help="Markdown to write the table to")
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
     a = parser.parse_args()
     if a.skill not in TASKS[a.task].skills:
@@ -97,7 +104,10 @@ def main() -> None:
             train(config_of(a.task, a.skill, variant, seed, a.samples), folder)
             found[variant].append(evaluate_skill(load_graph(folder, "last.pt"), a.skill, a.episodes, SECONDS))
             print(f"{variant}, seed {seed}: {found[variant][-1].success}", flush=True)
-    print(f"\n`{a.skill}`, {a.samples / 1e6:g} M samples a run, {a.episodes} episodes a seed:\n\n{table(found)}")
+    text = f"`{a.skill}`, {a.samples / 1e6:g} M samples a run, {a.seeds} seeds, {a.episodes} episodes each:\n\n{table(found)}\n"
+    print(f"\n{text}")
+    if a.report:
+        a.report.write_text(f"# {HEAD}\n\n{NOTE}\n\n{text}")
 
 
 if __name__ == "__main__":
