@@ -86,7 +86,9 @@ def test_episodes_start_where_their_clip_is(env):
     for k in range(env.num_envs):
         rows, _ = env.clips.rows(env.clip[k : k + 1], env.row[k : k + 1])
         np.testing.assert_allclose(env._qpos[k, BALL], env.clips.qpos[rows[0], BALL])
-        np.testing.assert_allclose(env._qpos[k, JOINTS], env.clips.qpos[rows[0], JOINTS])
+        larger = ball.RADIUS * (env.random.drawn["ball_radius"][k] - 1)  # hands lie on the ball that there is
+        expected = env.clips.qpos[rows[0], JOINTS] - env.clips.press[rows[0]] * larger
+        np.testing.assert_allclose(env._qpos[k, JOINTS], expected)
     assert len(np.unique(env.row)) > 4
 
 
@@ -185,15 +187,33 @@ def test_where_in_the_world_it_is_and_how_fast_the_actor_cannot_tell(env):
     assert (env.privileged - truth).abs().max() > 0.5
 
 
-def test_a_ball_out_of_sight_is_where_it_was_last_seen(env):
+def test_a_held_ball_out_of_sight_goes_on_as_it_went(env):
     env.random.drawn["object_loss"][:] = 0.0
     env.step(still(env))
     env._lost[:] = 2
-    before = env.inputs["object_position_in_base"].clone()
     for seen in (False, False, True):
+        before = {name: env.inputs[f"object_{name}_in_base"].clone() for name in ("position", "velocity")}
         env.step(still(env))
-        same = (env.inputs["object_position_in_base"] == before).all(dim=1)
+        told = before["position"] + CONFIG.period * before["velocity"]
+        same = torch.isclose(env.inputs["object_position_in_base"], told, atol=1e-5).all(dim=1)
         assert not same.any() if seen else same.all()
+        assert seen or torch.equal(env.inputs["object_velocity_in_base"], before["velocity"])
+
+
+def test_a_free_ball_out_of_sight_falls_and_bounces(env):
+    env.random.drawn["object_loss"][:] = 0.0
+    env.step(still(env))
+    base = env._qpos[:, 2].copy()
+    env._recorded["sensordata"][:] = 0.0  # nothing touches it
+    env._seen[:] = [0.5, 0.0, -0.3, 1.0, 0.0, 0.0]
+    everyone, dt = np.arange(env.num_envs), CONFIG.period
+    env._foretell(everyone)
+    np.testing.assert_allclose(env._seen, np.tile([0.52, 0, -0.3 - 4.905 * dt**2, 1, 0, -9.81 * dt], (8, 1)), atol=1e-9)
+    env._seen[:] = [0.5, 0.0, 0.0, 0.0, 0.0, -3.0]
+    env._seen[:, 2] = ball.RADIUS - base + 0.01  # 1 cm above the floor
+    env._foretell(everyone)
+    np.testing.assert_allclose(env._seen[:, 2], ball.RADIUS - base)
+    np.testing.assert_allclose(env._seen[:, 5], ball.RESTITUTION * (3.0 + 9.81 * dt), atol=1e-9)
 
 
 def test_a_ball_lost_from_the_first_tick_is_not_where_the_last_episodes_was(env):
