@@ -24,8 +24,9 @@ from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.observations import observe
 from policies.skillmimic.plan import GRAVITY
-from policies.skillmimic.randomisation import LOSS_TICKS, Randomisation
+from policies.skillmimic.randomisation import Randomisation
 from policies.skillmimic.rewards import SENSITIVITIES, Motion, Step, reward
+from policies.skillmimic.sight import Sight
 from policies.skillmimic.stance import arms, moved
 from policies.skillmimic.starts import thrown
 from policies.skillmimic.terminations import failed, up
@@ -82,8 +83,7 @@ class Env(VecEnv):
         self.skill, self.command = torch.zeros(n, len(self.graph.labels)), torch.zeros(n, 3)
         self.carries = {k: torch.zeros(n, *v) for k, v in self.graph.inputs().items() if k.startswith("carry_")}
         self.action, self.target = torch.zeros(n, self.num_actions), torch.zeros(n, joints)
-        self._seen = np.zeros((n, 6))  # the tracker's last answer
-        self._lost = np.zeros(n, np.int64)  # ticks until it sees the ball again
+        self.sight = Sight(n, config.period)
         self._last_points = np.zeros((n, self._place.shape[0] + 1, 3))
         self._last_joint_vel = np.zeros((n, joints))
         self.observation, self.privileged = torch.zeros(0), torch.zeros(0)
@@ -263,32 +263,11 @@ class Env(VecEnv):
         """(envs, 6) object_position_in_base and object_velocity_in_base as a tracker tells them."""
         n, rng, drawn = self.num_envs, self.rng, self.random.drawn
         newest = self.substeps - 1 - np.floor(drawn["object_delay"][:, 0]).astype(int)
-        qpos, qvel = (self._recorded[f][np.arange(n), newest] for f in ("qpos", "qvel"))
-        back = conjugate(qpos[:, 3:7])
-        position = rotate(back, qpos[:, BALL] - qpos[:, :3]) + drawn["object_offset"]
-        position += drawn["object_noise"] * rng.standard_normal((n, 3))
-        velocity = rotate(back, qvel[:, FLIGHT] - qvel[:, :3])
-        velocity += drawn["object_velocity_noise"] * rng.standard_normal((n, 3))
-        out_of_sight = (self._lost == 0) & (rng.random(n) < drawn["object_loss"][:, 0])
-        self._lost[out_of_sight] = rng.integers(*LOSS_TICKS, size=int(out_of_sight.sum()), endpoint=True)
-        sees = self._lost == 0
-        self._seen[sees] = np.concatenate([position, velocity], axis=1)[sees]
-        self._lost[~sees] -= 1
-        self._foretell(np.flatnonzero(~sees))
-        return self._seen
-
-    def _foretell(self, ids: np.ndarray) -> None:
-        """What a tracker says of balls that it does not see: they go on as they went, or fly and bounce."""
-        period, seen = self.config.period, self._seen[ids]
-        flies = ~self.contacts.touching(self._recorded["sensordata"][ids, -1:])[:, 0, 0]
-        seen[:, :3] += period * seen[:, 3:]
-        seen[:, 2] -= flies * GRAVITY * period**2 / 2
-        seen[:, 5] -= flies * GRAVITY * period
-        floor = ball.RADIUS - self._qpos[ids, 2]
-        bounces = (seen[:, 2] < floor) & (seen[:, 5] < 0)
-        seen[:, 5] *= np.where(bounces, -ball.RESTITUTION, 1.0)
-        seen[:, 2] = np.maximum(seen[:, 2], floor)
-        self._seen[ids] = seen
+        measured = _ball_in_base(*(self._recorded[f][np.arange(n), newest] for f in ("qpos", "qvel")))
+        measured[:, :3] += drawn["object_offset"] + drawn["object_noise"] * rng.standard_normal((n, 3))
+        measured[:, 3:] += drawn["object_velocity_noise"] * rng.standard_normal((n, 3))
+        held = self.contacts.touching(self._recorded["sensordata"][:, -1])[:, 0]
+        return self.sight.look(measured, drawn["object_loss"][:, 0], held, self._qpos[:, 2], rng)
 
     def _truth(self) -> np.ndarray:
         """(envs, size): what the critic may know beside the actor's observation; about 1 in size."""
@@ -297,13 +276,13 @@ class Env(VecEnv):
         reference = self.clips.motion(rows, way)
         back = conjugate(qpos[:, 3:7])
         turn = multiply(back, reference.orientation_base_in_world)
-        here = rotate(back, qpos[:, BALL] - qpos[:, :3])
+        seen = _ball_in_base(qpos, qvel)
         if self.graph.base is None:
             place = rotate(back, reference.points[:, 0] - qpos[:, :3])
             miss = rotate(back, reference.object_position - qpos[:, BALL])
         else:  # where the base has got to is not this actor's business
             place, turn = np.zeros((len(back), 3)), turn * [[1.0, 1.0, 1.0, 0.0]]
-            miss = reference.object_position - reference.points[:, 0] - here
+            miss = reference.object_position - reference.points[:, 0] - seen[:, :3]
         ahead = self.episode_length_buf.numpy()[:, None] / self.max_episode_length
         left = (self.clips.length[self.clip] - self.row)[:, None] / 200.0
         columns = [
@@ -312,8 +291,7 @@ class Env(VecEnv):
             turn[:, 1:] * np.where(turn[:, :1] < 0, -4, 4),
             (reference.joint_pos - qpos[:, JOINTS]) * 2,
             reference.joint_vel * 0.3,
-            here * 4,
-            rotate(back, qvel[:, FLIGHT] - qvel[:, :3]) * 0.5,
+            seen * ([4.0] * 3 + [0.5] * 3),
             miss * 4,
             rotate(back, reference.object_velocity) * 0.5,
             np.minimum(self.contacts.force(self._recorded["sensordata"][:, -1]) / 20.0, 3.0),
@@ -383,10 +361,7 @@ class Env(VecEnv):
             self.command[ids] = _tensor(rng.uniform(low, high, (k, 3)) * some)
             told = self.command[ids] * (self.skill[ids] @ self.graph.walks)
             self.carries["carry_base_skill"][ids] = self.graph.gait(told)
-        self._lost[ids] = 0
-        back = conjugate(qpos[:, 3:7])
-        self._seen[ids, :3] = rotate(back, qpos[:, BALL] - qpos[:, :3])
-        self._seen[ids, 3:] = rotate(back, qvel[:, FLIGHT] - qvel[:, :3])
+        self.sight.begin(ids, _ball_in_base(qpos, qvel))
         before = self.clips.rows(self.clip[ids], np.maximum(self.row[ids] - 1, 0))
         self._last_points[ids] = self.clips.motion(*before).points
         if self.discriminator is not None:
@@ -422,6 +397,13 @@ class Env(VecEnv):
         qvel[:, :3] += shift
         qvel[:, FLIGHT] += shift
         qvel[:, RATES] += w * rng.uniform(-0.2, 0.2, (k, self.model.nu))
+
+
+def _ball_in_base(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    """(k, 6) m and m/s of the ball, seen from bases that do not turn."""
+    back = conjugate(qpos[:, 3:7])
+    apart = qpos[:, BALL] - qpos[:, :3], qvel[:, FLIGHT] - qvel[:, :3]
+    return np.concatenate([rotate(back, x) for x in apart], axis=1)
 
 
 def _point_columns(body: RobotBody) -> np.ndarray:

@@ -14,6 +14,7 @@ from policies.skillmimic.config import TASKS, SkillMimic
 from policies.skillmimic.env import BALL, JOINTS, Env
 from policies.skillmimic.evaluate import evaluate, measure
 from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.sight import Sight
 from policies.skillmimic.starts import thrown
 from policies.skillmimic.terminations import TERMINATIONS
 from sim2real.contract import CARRY, INPUTS
@@ -190,7 +191,7 @@ def test_where_in_the_world_it_is_and_how_fast_the_actor_cannot_tell(env):
 def test_a_held_ball_out_of_sight_goes_on_as_it_went(env):
     env.random.drawn["object_loss"][:] = 0.0
     env.step(still(env))
-    env._lost[:] = 2
+    env.sight.lost[:] = 2
     for seen in (False, False, True):
         before = {name: env.inputs[f"object_{name}_in_base"].clone() for name in ("position", "velocity")}
         env.step(still(env))
@@ -200,26 +201,26 @@ def test_a_held_ball_out_of_sight_goes_on_as_it_went(env):
         assert seen or torch.equal(env.inputs["object_velocity_in_base"], before["velocity"])
 
 
-def test_a_free_ball_out_of_sight_falls_and_bounces(env):
-    env.random.drawn["object_loss"][:] = 0.0
-    env.step(still(env))
-    base = env._qpos[:, 2].copy()
-    env._recorded["sensordata"][:] = 0.0  # nothing touches it
-    env._seen[:] = [0.5, 0.0, -0.3, 1.0, 0.0, 0.0]
-    everyone, dt = np.arange(env.num_envs), CONFIG.period
-    env._foretell(everyone)
-    np.testing.assert_allclose(env._seen, np.tile([0.52, 0, -0.3 - 4.905 * dt**2, 1, 0, -9.81 * dt], (8, 1)), atol=1e-9)
-    env._seen[:] = [0.5, 0.0, 0.0, 0.0, 0.0, -3.0]
-    env._seen[:, 2] = ball.RADIUS - base + 0.01  # 1 cm above the floor
-    env._foretell(everyone)
-    np.testing.assert_allclose(env._seen[:, 2], ball.RADIUS - base)
-    np.testing.assert_allclose(env._seen[:, 5], ball.RESTITUTION * (3.0 + 9.81 * dt), atol=1e-9)
+def test_a_free_ball_out_of_sight_falls_and_bounces():
+    """The second one is a centimetre above the floor, and the third in somebody's hands."""
+    dt, height, sight = CONFIG.period, np.array([0.78, 0.7, 0.7]), Sight(3, CONFIG.period)
+    floor = ball.RADIUS - 0.7
+    sight.begin(
+        np.arange(3), np.array([[0.5, 0, -0.3, 1, 0, 0], [0.5, 0, floor + 0.01, 0, 0, -3], [0.4, 0, 0, 0, 0, 1.0]])
+    )
+    sight.lost[:] = 1
+    held = np.array([False, False, True])
+    told = sight.look(np.full((3, 6), 9.0), np.zeros(3), held, height, np.random.default_rng(0))
+    np.testing.assert_allclose(told[0], [0.5 + dt, 0, -0.3 - 9.81 * dt**2 / 2, 1, 0, -9.81 * dt])
+    np.testing.assert_allclose(told[1], [0.5, 0, floor, 0, 0, ball.RESTITUTION * (3 + 9.81 * dt)])
+    np.testing.assert_allclose(told[2], [0.4, 0, dt, 0, 0, 1])
+    assert (sight.look(np.full((3, 6), 9.0), np.zeros(3), held, height, np.random.default_rng(0)) == 9.0).all()
 
 
 def test_a_ball_lost_from_the_first_tick_is_not_where_the_last_episodes_was(env):
-    env._seen[:] = 9.0
+    env.sight.answer[:] = 9.0
     env._start(np.arange(env.num_envs))
-    env._lost[:] = 3
+    env.sight.lost[:] = 3
     env._observe()
     assert np.abs(env.inputs["object_position_in_base"].numpy()).max() < 0.5
 
