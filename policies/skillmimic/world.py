@@ -35,7 +35,8 @@ def training_world(
     spec = mujoco.MjSpec.from_file(str(robot.model_path))
     spec.option.timestep = timestep
     # With 6 iterations, which standing robots are content with, a step of the feet now and then kicks a ball out of the
-    # hands: a twentieth of all holds and a tenth of all carries failed for it. More cost nothing: the solver stops when it is done.
+    # hands: a twentieth of all holds and a tenth of all carries failed for it. More cost nothing: the solver stops when
+    # it is done.
     spec.option.iterations, spec.option.ls_iterations = 30, 20
     for joint in spec.joints:
         joint.frictionloss = 0.0  # damping stands in for it: a constraint less per joint
