@@ -16,7 +16,7 @@ from policies.ball import NAME, ball
 from policies.clips import skeleton
 from policies.clips.feasibility import place
 from policies.clips.format import Clip, ClipError
-from policies.clips.kinematics import smooth
+from policies.clips.kinematics import heading, smooth
 from policies.clips.resample import resample
 from policies.clips.robot import RobotBody
 from policies.clips.targets import scaled_ball
@@ -155,8 +155,7 @@ def view(clip: Clip, path: str | Path, body: RobotBody | None = None) -> None:
 def _cameras(clip: Clip) -> list[tuple[int, mujoco.MjvCamera]]:
     """The frames to draw and where from: from the front left, following the body slowly."""
     at = smooth(clip.base_position_in_world, clip.fps / 3)
-    w, x, y, z = clip.base_orientation_in_world[0]
-    yaw = np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    yaw = np.degrees(heading(clip.base_orientation_in_world[0]))
     tall = 0.85 if clip.header.body == "human" and clip.header.length_scale == 1 else 0.65
     thrown = clip.header.has_ball and clip.ball_position_in_world[:, 2].max() > 2 * tall
     height = 1.3 * tall if thrown else tall

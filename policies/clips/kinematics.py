@@ -32,6 +32,12 @@ def conjugate(q: np.ndarray) -> np.ndarray:
     return q * np.array([1.0, -1.0, -1.0, -1.0])
 
 
+def heading(q: np.ndarray) -> np.ndarray:
+    """(...,) rad about the vertical: where a body of orientation (..., 4) in the world looks."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
 def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Vectors (..., 3) turned by quaternions (..., 4)."""
     t = 2 * np.cross(q[..., 1:], v)

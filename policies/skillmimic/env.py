@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from policies import ball
-from policies.clips.kinematics import conjugate, multiply, quaternion_from_rotation_vector, rotate
+from policies.clips.kinematics import conjugate, heading, multiply, quaternion_from_rotation_vector, rotate
 from policies.clips.robot import POINT_NAMES, RobotBody
 from policies.env import POSITION_STEP, VELOCITY_STEP
 from policies.graph import one_hot
@@ -184,9 +184,7 @@ class Env(VecEnv):
     def _flight(self, clip: np.ndarray, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the balls of clips ``clip`` (k,) are thrown from, (k, 3) m, and how, (k, 3) m/s, at robots of ``qpos`` (k, nq)."""
         place, velocity = np.array([self._throws[c] for c in clip]).transpose(1, 0, 2)
-        w, x, y, z = qpos[:, 3:7].T
-        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        turn = quaternion_from_rotation_vector(yaw[:, None] * [0.0, 0.0, 1.0])
+        turn = quaternion_from_rotation_vector(heading(qpos[:, 3:7])[:, None] * [0.0, 0.0, 1.0])
         return qpos[:, :3] * [1.0, 1.0, 0.0] + rotate(turn, place), rotate(turn, velocity)
 
     def _judge(self, action_change: np.ndarray) -> Step:

@@ -10,8 +10,7 @@ import numpy as np
 from drivers.sim.camera import Camera
 from policies.skillmimic.evaluate import ticks_of
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.starts import object_start
-from policies.skillmimic.through_bytes import BEFORE, deploy_episode
+from policies.skillmimic.through_bytes import before, deploy_episode
 from sim2real.object.camera import CameraModel
 from sim2real.simulation import Simulation
 
@@ -26,8 +25,7 @@ def film(path: Path, graph: PolicyGraph, label: str, gif: Path) -> int:
     """Write ``gif`` of a skill of a policy file, robot and ball drawn at random and the ball seen by a camera. Returns which
     run it shows, from 1; 0: none was good, it shows the last."""
     clips = np.flatnonzero(graph.clips.skill == graph.labels.index(label))
-    in_hands = label != graph.labels[0] and object_start(graph, int(clips[0]))["how"] == "held"
-    skill = BEFORE if in_hands else 0.0  # s: when it begins
+    skill = before(graph, int(clips[0]))  # s: when it begins
 
     def run(seed: int, watch: Callable[[Simulation], None] = lambda simulation: None) -> bool:
         clip = int(clips[seed % len(clips)])

@@ -11,7 +11,7 @@ import dataclasses
 import sys
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from policies.skillmimic.env import Env
 from policies.skillmimic.evaluate import ticks_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.plan import KNOTS, REACH, ROOT, Correction
-from policies.skillmimic.randomisation import TABLE
 
 with warnings.catch_warnings():  # that there is no matplotlib
     warnings.simplefilter("ignore", UserWarning)
@@ -140,21 +139,18 @@ def optimise(
     each: int,
     keep: Callable[[Correction, int], None],
     seconds: float = 4.0,
-    ranges: Mapping[str, tuple[float, float]] | None = None,
     seed: int = 0,
 ) -> None:
     """Search for ``generations``, each robot of ``each`` judging every candidate once a generation.
 
     ``keep`` is given the middle of the search's distribution after every generation, and how many samples that took. Prints
-    a line for each. ``seconds``: of an episode that does not end by itself. ``ranges``: of terms of the randomisation, where
-    the search shall meet what is hard more often than it comes (low, high).
+    a line for each. ``seconds``: of an episode that does not end by itself.
     """
     config = dataclasses.replace(config, skills=(skill,), envs=candidates * each, anywhere=False, push_chance=0.0)
     graph = PolicyGraph(config)
     ticks = ticks_of(graph, 0, seconds)
     env = Env(dataclasses.replace(config, frames=ticks), seed, graph)
     env.rng = Alike(seed, each, candidates)
-    env.random.table = TABLE | {name: TABLE[name]._replace(low=a, high=b) for name, (a, b) in (ranges or {}).items()}
     search = Search(graph, 0)
     start = search.vector(plan.read(config.corrections, [skill], len(graph.arms))[0])
     options = {"popsize": candidates - 1, "seed": seed + 1, "verbose": -9, "CMA_diagonal": 15}
@@ -195,14 +191,7 @@ def main() -> None:
     parser.add_argument("--candidates", type=int, default=24)
     parser.add_argument("--each", type=int, default=16, help="randomised robots a candidate is judged by")
     parser.add_argument("--seconds", type=float, default=4.0, help="of an episode that does not end by itself")
-    parser.add_argument(
-        "--range", nargs=3, action="append", default=[], metavar=("TERM", "LOW", "HIGH"),
-        help="draw a term of the randomisation from here only, where it is hard",
-    )  # fmt: skip
     arguments = parser.parse_args()
-    ranges = {name: (float(low), float(high)) for name, low, high in arguments.range}
-    if unknown := set(ranges) - set(TABLE):
-        sys.exit(f"--range: got '{unknown.pop()}', expected one of {', '.join(TABLE)}")
     config = TASKS[arguments.task]
     if arguments.skill not in config.skills or config.corrections is None:
         sys.exit(f"skill: got '{arguments.skill}', expected one of {', '.join(config.skills)}")
@@ -210,7 +199,7 @@ def main() -> None:
     file, skill = config.corrections, arguments.skill
     keep = lambda c, samples: write(file, skill, c, samples)  # noqa: E731
     a = arguments
-    optimise(config, skill, a.generations, a.candidates, a.each, keep, a.seconds, ranges)
+    optimise(config, skill, a.generations, a.candidates, a.each, keep, a.seconds)
 
 
 if __name__ == "__main__":

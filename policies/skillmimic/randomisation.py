@@ -76,7 +76,7 @@ TABLE: dict[str, Term] = {
     "object_noise": Term(0.0, 0.008, 1, "m, standard deviation of the position"),
     "object_velocity_noise": Term(0.0, 0.2, 1, "m/s, standard deviation: it is differentiated"),
     "object_delay": Term(
-        0.0, 3.0, 1, "substeps of 5 ms (whole ones): what prediction leaves; a flight is seen 1 to 2 ms late, 8 at most"
+        0.0, 3.0, 1, "substeps of 5 ms (whole ones): what prediction leaves; flights are seen up to 10 ms off"
     ),
     "object_loss": Term(0.0, 0.05, 1, "chance a tick that the ball is lost from sight; its course is foretold then"),
 }

@@ -8,14 +8,14 @@ from its soft start, or from the skill before, and not from the clip's first fra
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from drivers.sim.ball import MASS, RADIUS
-from policies.clips.kinematics import multiply, rotate
+from policies.clips.kinematics import heading, multiply, rotate
 from policies.clips.robot import POINT_NAMES
 from policies.skillmimic.evaluate import Measures, Trace, measure, succeeded, ticks_of
 from policies.skillmimic.graph import PolicyGraph
@@ -120,7 +120,7 @@ class _Laid(NamedTuple):
 
     @classmethod
     def at(cls, state: Motion, reference: Motion) -> _Laid:
-        yaw = _yaw(reference.orientation_base_in_world[0]) - _yaw(state.orientation_base_in_world[0])
+        yaw = heading(reference.orientation_base_in_world[0]) - heading(state.orientation_base_in_world[0])
         turn = np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
         return cls(turn, (reference.points[0, 0] - rotate(turn, state.points[0, 0])) * [1.0, 1.0, 0.0])
 
@@ -188,6 +188,13 @@ class _Body:
         )
 
 
+def before(graph: PolicyGraph, clip: int) -> float:
+    """s of the policy's first skill before that of clip number ``clip``: none where that is the first, or where somebody
+    else has the ball, and the arms come from the soft start."""
+    in_hands = graph.clips.skill[clip] > 0 and object_start(graph, clip)["how"] == "held"
+    return BEFORE if in_hands else 0.0
+
+
 def deploy_episode(
     path: Path,
     graph: PolicyGraph,
@@ -207,9 +214,8 @@ def deploy_episode(
     config, ticks = graph.config, ticks_of(graph, clip, seconds)
     label, first = graph.labels[graph.clips.skill[clip]], graph.labels[0]
     starts = {n: ObjectStart.model_validate(object_start(graph, clip if n == label else 0)) for n in {first, label}}
-    # Else somebody has the ball, and the arms come from the soft start.
-    in_hands = label != first and starts[label].how == "held"
-    steps = [(first, BEFORE)] * in_hands + [(label, ticks * config.period + AFTER)]
+    lead = before(graph, clip)
+    steps = [(first, lead)] * (lead > 0) + [(label, ticks * config.period + AFTER)]
     judge = Judge(graph, clip, ticks)
 
     def each_tick(simulation: Simulation) -> None:
@@ -252,8 +258,3 @@ def random_ball(rng: np.random.Generator) -> dict[str, float]:
     """The ball's terms of the randomisation table."""
     x = {name: float(rng.uniform(TABLE[name].low, TABLE[name].high)) for name in TABLE if name.startswith("ball_")}
     return {"mass": MASS * x["ball_mass"], "radius": RADIUS * x["ball_radius"], "restitution": x["ball_restitution"]}
-
-
-def _yaw(q: Sequence[float]) -> float:
-    w, x, y, z = q
-    return float(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))

@@ -22,7 +22,7 @@ class Args:
     file: tyro.conf.Positional[Path] = Path("policies/g1/basics.onnx")
     """policy file"""
     episodes: int = 100
-    """per skill; a fifth of it per switch, and per cell of --tables"""
+    """per skill; a fifth of it per switch, and per cell of --tables, there 25 at most"""
     deployed: int = 40
     """runs through the bytes, undisturbed, and as many pushed; of ball skills, per skill, with the ball known and seen"""
     report: Path | None = None
