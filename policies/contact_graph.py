@@ -121,7 +121,7 @@ def can_touch(a: mujoco.MjsGeom, b: mujoco.MjsGeom) -> bool:
 def reference_edges(graph: ContactGraph, hands: np.ndarray, ball: str, sides: Sequence[str]) -> np.ndarray:
     """(T, edges) bool: the reference graph of a clip whose per-hand contacts are ``hands`` (T, len(sides)) bool.
 
-    ``sides``: the geom of each hand. An edge between ``ball`` and a node with hands is 1 where one of its hands touches;
+    ``sides``: a geom of each hand. An edge between ``ball`` and a node with hands is 1 where one of its hands touches;
     every other edge of a reference is 0, as in the paper.
     """
     result = np.zeros((len(hands), len(graph.edges)), bool)

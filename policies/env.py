@@ -137,6 +137,7 @@ class Env(VecEnv):
             velocity=np.column_stack([cos * vx + sin * vy, cos * vy - sin * vx]),
             command=seen.command.numpy(),
             angular_velocity_base_in_base=qvel[:, 3:6],
+            resting=self.graph.gait.resting(seen.gait)[:, 0].numpy().astype(float),
             height=qpos[:, 2],
             height_reference=np.interp(posture[:, self._knee], *self._height),
             reference=reference,

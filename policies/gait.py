@@ -38,7 +38,9 @@ class Stride:
     ahead: float = 0.07  # rad of the capture point beyond which a step is needed: forwards,
     behind: float = 0.08  # backwards,
     aside: float = 0.11  # and sideways
-    calm: float = 0.5  # share of these below which the clock may rest
+    calm: float = 0.7  # share of these below which the clock may rest
+    patience: float = 0.1  # s over which the capture point is averaged before that counts, for speeds are noisy ...
+    alarm: float = 2.5  # ... unless it is so many times as far
     acceleration: float = 1.2  # m/s^2 (rad/s^2) of a command
     idle: float = 0.05  # m/s (rad/s): a smaller command is none
 
@@ -109,21 +111,28 @@ class Gait(nn.Module):
             -leg * (gyro[:, 0:1] + of(joint_vel, "roll")),
         )
 
+    def capture(self, lean: Lean) -> Tensor:
+        """The capture point (N, 2) rad, forwards and left."""
+        speed = torch.cat([lean.forward_speed, lean.left_speed], dim=-1)
+        return torch.cat([lean.forward, lean.left], dim=-1) + speed / (self.stride.pendulum * self.stride.leg)
+
+    def steady(self, last: Tensor, lean: Lean) -> Tensor:
+        """The capture point (N, 2) rad averaged over ``stride.patience``, ``last`` a tick ago."""
+        return last + self.period / (self.period + self.stride.patience) * (self.capture(lean) - last)
+
     @staticmethod
     def resting(phase: Tensor) -> Tensor:
         """Whether both feet are on the ground to stay (N, 1) bool."""
         return (phase == 0.0) | (phase == 0.5)
 
-    def advance(self, phase: Tensor, command: Tensor, lean: Lean) -> Tensor:
+    def advance(self, phase: Tensor, command: Tensor, lean: Lean, steady: Tensor) -> Tensor:
         """This tick's phase (N, 1) in [0, 1): the left foot is in the air before 0.5, the right one after it, and at
-        exactly 0 and 0.5 both feet rest. ``command`` (N, 3): forward m/s, left m/s, turn rad/s."""
+        exactly 0 and 0.5 both feet rest. ``command`` (N, 3): forward m/s, left m/s, turn rad/s; ``steady``: see there."""
         s = self.stride
         resting = self.resting(phase)
         limit = torch.where(resting, 1.0, s.calm)
-        capture = lean.forward + lean.forward_speed / (s.pendulum * s.leg)
-        capture_left = lean.left + lean.left_speed / (s.pendulum * s.leg)
         fast = lean.forward_speed.abs() > 0.25 * (2 - limit)  # a step in mid-flight ends only when slow
-        falling = (capture > s.ahead * limit) | (capture < -s.behind * limit) | (capture_left.abs() > s.aside * limit)
+        falling = self._beyond(steady, limit) | self._beyond(self.capture(lean), s.alarm * limit)
         need = (command.abs().amax(-1, keepdim=True) > s.idle) | falling | (fast & ~resting)
         unloaded = torch.where(lean.left_speed > 0, 0.5, 0.0)  # pushed to the left: the right foot is light
         moved = torch.where(resting, unloaded, phase) + self.step
@@ -131,6 +140,12 @@ class Gait(nn.Module):
         landed = torch.where(crossed & ~need, torch.floor(2 * moved) / 2, moved)
         following = landed - torch.floor(landed)
         return torch.where(resting & ~need, phase, following)
+
+    def _beyond(self, capture: Tensor, limit: Tensor | float) -> Tensor:
+        """Whether a capture point (N, 2) has left the feet, times ``limit`` (N, 1): (N, 1) bool."""
+        s = self.stride
+        forward, left = capture[:, 0:1], capture[:, 1:2]
+        return (forward > s.ahead * limit) | (forward < -s.behind * limit) | (left.abs() > s.aside * limit)
 
     def offsets(self, phase: Tensor, command: Tensor, lean: Lean) -> Tensor:
         """What steps add to the reference pose (N, n) rad."""

@@ -84,6 +84,7 @@ class PolicyGraph(nn.Module):
         carry_posture: Tensor,
         carry_command: Tensor,
         carry_gait: Tensor,
+        carry_capture: Tensor,
         carry_action: Tensor,
         pose: Tensor | float = 0.0,
     ) -> Signals:
@@ -93,10 +94,11 @@ class PolicyGraph(nn.Module):
         command = self.gait.ramp(carry_command, command_velocity * (skill @ self.walks))
         gravity = gravity_in_base(orientation_base_in_world)
         lean = self.gait.lean(carry_gait, gravity, angular_velocity_base_in_base, joint_pos - posture, joint_vel)
-        gait = self.gait.advance(carry_gait, command, lean)
+        capture = self.gait.steady(carry_capture, lean)
+        gait = self.gait.advance(carry_gait, command, lean, capture)
         reference = posture + self.gait.offsets(gait, command, lean)
         return Signals(joint_pos, joint_vel, gravity, angular_velocity_base_in_base, skill, self.home, phase, posture,
-                       command, gait, reference, carry_action)  # fmt: skip
+                       command, gait, capture, reference, carry_action)  # fmt: skip
 
     def target(self, signals: Signals, action: Tensor) -> Tensor:
         """Joint targets (N, n) rad for a clipped ``action`` (N, driven)."""
@@ -120,6 +122,7 @@ class PolicyGraph(nn.Module):
             "carry_posture": signals.posture,
             "carry_command": signals.command,
             "carry_gait": signals.gait,
+            "carry_capture": signals.capture,
             "carry_action": action,
         }
 
@@ -143,6 +146,7 @@ class PolicyGraph(nn.Module):
             "carry_posture": [n],
             "carry_command": [3],
             "carry_gait": [1],
+            "carry_capture": [2],
             "carry_action": [len(self.driven)],
         }
 
@@ -172,6 +176,7 @@ class PolicyGraph(nn.Module):
         carry_posture: Tensor,
         carry_command: Tensor,
         carry_gait: Tensor,
+        carry_capture: Tensor,
         carry_action: Tensor,
     ) -> tuple[Tensor, ...]:
         """One tick of a batch of one. Returns the tensors of ``outputs()`` in that order.
@@ -182,7 +187,7 @@ class PolicyGraph(nn.Module):
         every = torch.eye(len(self.labels))
         rows = lambda x: x.expand(len(self.labels), -1)  # noqa: E731
         measured = joint_pos, joint_vel, orientation_base_in_world, angular_velocity_base_in_base, command_velocity
-        carried = carry_phase, carry_skill, carry_posture, carry_command, carry_gait, carry_action
+        carried = carry_phase, carry_skill, carry_posture, carry_command, carry_gait, carry_capture, carry_action
         might = self.advance(*map(rows, measured), every, *map(rows, carried))
         observations = observe(might)
         signals = Signals(*(x if x is self.home else skill @ x for x in might))

@@ -38,7 +38,7 @@ def observation_mirror(graph: PolicyGraph) -> Turn:
     joints, labels = len(graph.joint_names), len(graph.labels)
     zeros = lambda k: torch.zeros(1, k)  # noqa: E731
     blank = Signals(zeros(joints), zeros(joints), zeros(3), zeros(3), zeros(labels), zeros(joints), zeros(1), zeros(joints),
-                    zeros(3), zeros(1), zeros(joints), zeros(len(graph.driven)))  # fmt: skip
+                    zeros(3), zeros(1), zeros(2), zeros(joints), zeros(len(graph.driven)))  # fmt: skip
     index: list[int] = []
     sign: list[float] = []
     for _, kind, term in TERMS.values():

@@ -24,6 +24,7 @@ class Signals(NamedTuple):
     posture: Tensor  # rad, the skill's, without steps
     command: Tensor  # (N, 3) forward m/s, left m/s, turn rad/s: what is followed now
     gait: Tensor  # (N, 1) in [0, 1), see gait.Gait
+    capture: Tensor  # (N, 2) rad, forwards and left, averaged: see gait.Gait
     reference: Tensor  # rad, with steps
     last_action: Tensor
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 LEGS, UPPER = slice(0, 12), slice(12, 29)
+IDLE = 0.05  # m/s (rad/s): a smaller command is none
 
 
 class Tick(NamedTuple):
@@ -20,6 +21,7 @@ class Tick(NamedTuple):
     velocity: np.ndarray  # (N, 2) m/s of the base over the ground, forwards and to the left
     command: np.ndarray  # (N, 3) m/s, m/s, rad/s
     angular_velocity_base_in_base: np.ndarray
+    resting: np.ndarray  # (N,) 1 where both feet are on the ground to stay, else 0
     height: np.ndarray  # (N,) m, of the base
     height_reference: np.ndarray  # (N,) m, with the feet flat at the reference pose
     reference: np.ndarray  # (N, n) rad
@@ -39,12 +41,18 @@ def _near(error: np.ndarray, width: float) -> np.ndarray:
     return np.exp(-np.sum(np.square(error), axis=-1) / width**2)
 
 
+def _rests(t: Tick) -> np.ndarray:
+    """Whether the feet stay where they are, unless the robot is told to go somewhere."""
+    return np.maximum(t.resting, np.any(np.abs(t.command) > IDLE, axis=-1))
+
+
 REWARDS: dict[str, Reward] = {
-    "upper_body": Reward(0.15, lambda t: _near((t.joint_pos - t.reference)[:, UPPER], 0.7)),
-    "legs": Reward(0.15, lambda t: _near((t.joint_pos - t.reference)[:, LEGS], 0.6)),
+    "upper_body": Reward(0.1, lambda t: _near((t.joint_pos - t.reference)[:, UPPER], 0.7)),
+    "legs": Reward(0.1, lambda t: _near((t.joint_pos - t.reference)[:, LEGS], 0.6)),
     "upright": Reward(0.2, lambda t: _near(t.gravity_in_base[:, :2], 0.2)),
     "height": Reward(0.1, lambda t: _near((t.height - t.height_reference)[:, None], 0.08)),
-    "velocity": Reward(0.3, lambda t: _near(t.velocity - t.command[:, :2], 0.2)),
+    "rest": Reward(0.2, _rests),
+    "velocity": Reward(0.2, lambda t: _near(t.velocity - t.command[:, :2], 0.2)),
     "turn": Reward(0.05, lambda t: _near((t.angular_velocity_base_in_base - t.command)[:, 2:], 0.4)),
     "steady": Reward(0.05, lambda t: _near(t.angular_velocity_base_in_base[:, :2], 1.0)),
     "action_rate": Reward(-0.006, lambda t: np.sum(np.square(t.action - t.last_action), axis=-1)),

@@ -117,7 +117,7 @@ def test_home_stands_with_flat_feet(robot: RobotConfig, model: mujoco.MjModel) -
 
 
 @pytest.mark.parametrize(
-    "left, right", [("left_shin", "right_shin"), ("left_hand", "chest"), ("left_hand", "right_hand")]
+    "left, right", [("left_shin", "right_shin"), ("left_forearm", "chest"), ("left_forearm", "right_forearm")]
 )
 def test_what_could_collide_does(model: mujoco.MjModel, left: str, right: str) -> None:
     a, b = model.geom(left), model.geom(right)

@@ -104,12 +104,12 @@ def ball(
 
 
 def palms(spec: mujoco.MjSpec) -> tuple[str, ...]:
-    """Names of the geoms that are hands, left and right: the first solid one of the body with the site ``<side>_palm``."""
+    """Names of the geoms that are hands, left before right: the solid ones of the bodies with the site ``<side>_palm``."""
     found = []
     for side in ("left", "right"):
         site = spec.site(f"{side}_palm")
         solid = [g.name for g in site.parent.geoms if g.contype or g.conaffinity] if site is not None else []
-        found += solid[:1]
+        found += solid
     return tuple(found)
 
 

@@ -26,7 +26,7 @@ GRAVITY = 9.81  # m/s^2
 SOLVER = "daqp"
 CLEAR = 0.015  # m between palm and ball while they do not touch
 SMOOTHING = 0.5  # frames
-TURNED = 0.03  # m/rad: what a turned hand counts beside one that is elsewhere
+TURNED = 0.1  # m/rad: what a turned hand counts beside one that is elsewhere
 TICK = 0.02  # s of a policy: a stroke lasts some of them
 SETTLING = 3  # strokes before the one that is kept: then inverse kinematics has forgotten where it began
 
@@ -110,8 +110,7 @@ def dribble(body: RobotBody, name: str, stroke: Stroke = Stroke(), side: str = "
         pose[[names.index(f"{s}_{joint}_joint") for s in SIDES]] = angle
     height = float(standing_height(body.model, pose[None])[0])
     model = body.model
-    hand = int(body.hand_geoms[SIDES.index(side)][0])
-    touch = ball.RADIUS + float(model.geom_size[hand, 0])
+    touch = body.palm_height(ball.RADIUS)
     place = np.array([stroke.place[0], sign * stroke.place[1]])
 
     data = mujoco.MjData(model)
@@ -128,11 +127,10 @@ def dribble(body: RobotBody, name: str, stroke: Stroke = Stroke(), side: str = "
     posture.set_target(q)
     freeze = mink.DofFreezingTask(model, np.flatnonzero(still).tolist())
     limits = [mink.ConfigurationLimit(model)]
+    down = mink.SO3.from_x_radians(np.pi)
     rows = []
     for k in range(len(t)):
-        reach.set_target(
-            mink.SE3.from_rotation_and_translation(mink.SO3.identity(), np.array([*place, palm[k] + touch]))
-        )
+        reach.set_target(mink.SE3.from_rotation_and_translation(down, np.array([*place, palm[k] + touch])))
         for _ in range(12):
             speed = mink.solve_ik(
                 configuration, [reach, posture], 0.1, SOLVER, damping=1e-3, limits=limits, constraints=[freeze]

@@ -50,17 +50,18 @@ class Costs:
     palm: float
     palm_on_ball: float  # added to `palm` where it is placed by the ball
     fingers: float
+    palm_turn: float  # towards the ball, where the palm is placed by it
     posture: float
     posture_of_waist: float
 
 
 FOLLOW = Costs(
-    base=1.0, base_turn=2.0, trunk_turn=1.0, balance=2.0, knee=0.3, foot=5.0, foot_turn=2.0, stance=20.0, elbow=0.7,
-    palm=2.0, palm_on_ball=8.0, fingers=0.15, posture=0.03, posture_of_waist=0.03,
+    base=1.0, base_turn=2.0, trunk_turn=1.0, balance=2.0, knee=0.3, foot=20.0, foot_turn=2.0, stance=20.0, elbow=0.7,
+    palm=2.0, palm_on_ball=8.0, fingers=0.15, palm_turn=0.2, posture=0.03, posture_of_waist=0.03,
 )  # fmt: skip
 POLISH = Costs(
-    base=20.0, base_turn=10.0, trunk_turn=0.3, balance=0.0, knee=0.0, foot=10.0, foot_turn=5.0, stance=60.0, elbow=0.0,
-    palm=0.0, palm_on_ball=40.0, fingers=0.0, posture=0.6, posture_of_waist=2.0,
+    base=20.0, base_turn=10.0, trunk_turn=0.3, balance=0.0, knee=0.0, foot=40.0, foot_turn=5.0, stance=60.0, elbow=0.0,
+    palm=0.0, palm_on_ball=40.0, fingers=0.0, palm_turn=0.5, posture=0.6, posture_of_waist=2.0,
 )  # fmt: skip
 
 
@@ -91,6 +92,7 @@ class Imitator:
         self.posture = mink.PostureTask(model, 1.0)
         self.waist = np.zeros(model.nv, bool)
         self.waist[body.qvel_at] = [j.group == "waist" for j in body.robot.joints]
+        self.flat = [len(geoms) > 1 for geoms in body.hand_geoms]  # one geom alone is as round on every side
         self.finger_axes = [self._finger_axis(k) for k in range(2)]
         self.tasks = [
             *(self.base, self.trunk, self.balance, self.posture),
@@ -144,12 +146,17 @@ class Imitator:
             free, held = elbow + goal.forearms[t, k], goal.palms[t, k]
             by_ball = goal.by_ball[t, k]
             now = data.site_xmat[self.body.palms[k]].reshape(3, 3)
-            turned = _least_turn(now @ self.finger_axes[k], goal.fingers[t, k]) @ now
+            turned = _least_turn(now @ self.finger_axes[k], goal.fingers[t, k]) @ now if costs.fingers else now
+            towards = kinematics.unit(goal.ball[t] - data.site_xpos[self.body.palms[k]])
+            turned = _least_turn(turned[:, 2], by_ball * towards + (1 - by_ball) * turned[:, 2]) @ turned
             self.elbows[k].set_target(_pose(elbow, np.eye(3)))
             self.elbows[k].set_position_cost(costs.elbow * (1 - 0.8 * by_ball))
             self.palms[k].set_target(_pose(by_ball * held + (1 - by_ball) * free, turned))
             self.palms[k].set_position_cost(costs.palm + costs.palm_on_ball * by_ball)
-            self.palms[k].set_orientation_cost(costs.fingers)
+            lays = (
+                costs.fingers + self.flat[k] * costs.palm_turn * by_ball
+            )  # turning about its own axis lays no palm down
+            self.palms[k].set_orientation_cost([lays, lays, costs.fingers])
 
     def solve(self, goal: Targets, t: int, costs: Costs, steps: int) -> np.ndarray:
         """The configuration (nq,) of frame ``t``, from the one before."""
@@ -200,7 +207,7 @@ class Imitator:
 def retarget(clip: Clip, body: RobotBody, fps: float = FPS, ball_radius: float = RADIUS) -> tuple[Clip, Targets]:
     """``clip`` of a human as a clip of the robot, and the targets it was solved for. Raises ClipError."""
     body = _within_limits(body)
-    goal = targets(clip, body, fps, ball_radius, hand_radius(body))
+    goal = targets(clip, body, fps, ball_radius, body.palm_height(ball_radius))
     imitator = Imitator(body, fps, STEPS)
     path = imitator.follow(goal)
     reachable = pulled_in(
@@ -212,11 +219,6 @@ def retarget(clip: Clip, body: RobotBody, fps: float = FPS, ball_radius: float =
         path = imitator.polish(goal, _smoothed(path, width))
     path = _smoothed(path, LAST_SMOOTHING)
     return _clip(clip, body, goal, path), goal
-
-
-def hand_radius(body: RobotBody) -> float:
-    """From the palm site to the hand's surface, m: the thickness of the geom that carries it."""
-    return float(np.mean([body.model.geom_size[g, 0].max() if len(g) else 0.0 for g in body.hand_geoms]))
 
 
 def _within_limits(body: RobotBody) -> RobotBody:
@@ -274,7 +276,8 @@ def _pose(position: np.ndarray, rotation: np.ndarray) -> mink.SE3:
 
 
 def _least_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(3, 3): the smallest rotation that takes unit vector ``a`` to ``b``."""
+    """(3, 3): the smallest rotation that takes unit vector ``a`` to the direction of ``b``."""
+    b = kinematics.unit(b)
     axis, cosine = np.cross(a, b), float(a @ b)
     sine = float(np.linalg.norm(axis))
     if sine < 1e-9:

@@ -93,6 +93,30 @@ class RobotBody:
         spheres = [g[self.model.geom_type[g] == sphere] for g in feet]
         return [s if len(s) else g for s, g in zip(spheres, feet, strict=True)]
 
+    def palm_height(self, radius: float) -> float:
+        """m from a palm site, along its z axis, which points out of the palm, to the centre of a ball of ``radius`` m that
+        lies on the hand: the mean of both; 0 for a robot whose hands touch nothing."""
+        spec = mujoco.MjSpec.from_file(str(self.robot.model_path))
+        sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+        spec.worldbody.add_body().add_geom(type=sphere, size=[radius, 0, 0], mass=0)  # last: the robot keeps its ids
+        model = spec.compile()
+        data, ball = mujoco.MjData(model), model.ngeom - 1
+        mujoco.mj_kinematics(model, data)
+        heights = []
+        for k in range(len(SIDES)):
+            site = self.palms[k]
+            low, high = 0.0, radius + 1.0
+            for _ in range(40):
+                middle = (low + high) / 2
+                data.geom_xpos[ball] = data.site_xpos[site] + middle * data.site_xmat[site].reshape(3, 3)[:, 2]
+                apart = min(
+                    (mujoco.mj_geomDistance(model, data, g, ball, 2.0, None) for g in self.hand_geoms[k].tolist()),
+                    default=0.0,
+                )
+                low, high = (middle, high) if apart < 0 else (low, middle)
+            heights.append(low)
+        return float(np.mean(heights))
+
     def _solid(self, body: int) -> np.ndarray:
         geoms = np.flatnonzero(self.model.geom_bodyid == body)
         return geoms[(self.model.geom_contype[geoms] != 0) | (self.model.geom_conaffinity[geoms] != 0)]

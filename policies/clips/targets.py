@@ -71,8 +71,9 @@ def scaled_ball(ball: np.ndarray, s: float, radius: float) -> np.ndarray:
     return np.concatenate([scaled[:, :2], np.maximum(scaled[:, 2:], radius)], axis=1)
 
 
-def targets(clip: Clip, body: RobotBody, fps: float, ball_radius: float, hand_radius: float) -> Targets:
-    """Everything a human ``clip`` asks of the robot, at the robot's ``fps``. Raises ClipError for a robot's clip."""
+def targets(clip: Clip, body: RobotBody, fps: float, ball_radius: float, palm_height: float) -> Targets:
+    """Everything a human ``clip`` asks of the robot, at the robot's ``fps``. A palm on the ball is ``palm_height`` m from its
+    centre. Raises ClipError for a robot's clip."""
     if clip.header.body != "human":
         raise ClipError(f"clip '{clip.name}': got one of {clip.header.body}, expected a human's")
     s = length_scale(body)
@@ -86,7 +87,7 @@ def targets(clip: Clip, body: RobotBody, fps: float, ball_radius: float, hand_ra
     feet, foot_frames = _feet(points, base_frame, s, stance, body)
     base = _within_reach(base, base_frame, feet, foot_frames, body)
     upper, fore, fingers = _arms(points, body)
-    palms, by_ball = _palms(clip, s, ball, ball_radius + hand_radius)
+    palms, by_ball = _palms(clip, s, ball, palm_height)
     return Targets(
         fps=fps,
         length_scale=s,

@@ -19,7 +19,6 @@ from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.plan import GRAVITY, Rows
 from policies.skillmimic.rewards import Motion
 from policies.skillmimic.stance import crouched, stand, trunk
-from policies.skillmimic.world import hands
 
 SINGULAR = 0.08  # m/rad: damps the way back from palms to joints where an arm is stretched
 LATE = 0.02  # s, on average, until a target acts: it is held for a tick, and travels
@@ -84,7 +83,8 @@ class ReferenceClips:
         self.first = np.cumsum([0, *self.length[:-1]])
         self.skill = np.array(labels)
         self.swing, self.loop = (np.array([config.skills[k] in c for k in labels]) for c in (config.swing, config.loop))
-        self._motion = _concatenate([_motion(c, graph, hands(body)) for c in fine])
+        sides = tuple(model.geom(int(geoms[0])).name for geoms in body.hand_geoms)
+        self._motion = _concatenate([_motion(c, graph, sides) for c in fine])
         rows = [_resampled(grip(c, model, body, kp, config.grip), len(f)) for c, f in zip(clips, fine, strict=True)]
         press, effort = (np.concatenate([r[i] for r in rows]) for i in (0, 1))
         m = self._motion
@@ -251,7 +251,7 @@ def _check(clip: Clip, body: RobotBody) -> None:
         )
 
 
-def _motion(clip: Clip, graph: ContactGraph, palms: tuple[str, ...]) -> Motion:
+def _motion(clip: Clip, graph: ContactGraph, sides: tuple[str, ...]) -> Motion:
     points = np.concatenate([clip.base_position_in_world[:, None], clip.points_in_world], axis=1)
     return Motion(
         points=points,
@@ -261,7 +261,7 @@ def _motion(clip: Clip, graph: ContactGraph, palms: tuple[str, ...]) -> Motion:
         joint_vel=clip.joint_vel,
         object_position=clip.ball_position_in_world,
         object_velocity=clip.ball_velocity_in_world,
-        contact=reference_edges(graph, clip.contact[:, :2], "ball", palms).astype(float),
+        contact=reference_edges(graph, clip.contact[:, :2], "ball", sides).astype(float),
     )
 
 

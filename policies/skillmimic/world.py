@@ -14,8 +14,8 @@ EDGES = [("ball", "hands"), ("ball", "body"), ("body", "hands")]  # of the paper
 
 
 def hands(body: RobotBody) -> tuple[str, ...]:
-    """Names of the geoms that are hands: one a side, left and right."""
-    return tuple(body.model.geom(int(geoms[0])).name for geoms in body.hand_geoms)
+    """Names of the geoms that are hands, left before right."""
+    return tuple(body.model.geom(int(g)).name for geoms in body.hand_geoms for g in geoms)
 
 
 def paper_graph(spec: mujoco.MjSpec, palms: tuple[str, ...]) -> ContactGraph:

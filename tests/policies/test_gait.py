@@ -23,7 +23,7 @@ FORWARD = torch.tensor([[0.5, 0.0, 0.0]])
 def clock(phase: float, ticks: int, command: torch.Tensor = NONE, lean: Lean = STILL) -> list[float]:
     phases = [torch.tensor([[phase]])]
     for _ in range(ticks):
-        phases.append(GAIT.advance(phases[-1], command, lean))
+        phases.append(GAIT.advance(phases[-1], command, lean, GAIT.capture(lean)))
     return [p.item() for p in phases[1:]]
 
 
@@ -60,6 +60,33 @@ def test_a_step_once_begun_is_finished_and_then_the_feet_rest():
 def test_a_capture_point_outside_the_feet_asks_for_a_step(lean, steps):
     falling = STILL._replace(**{k: torch.tensor([[v]]) for k, v in lean.items()})
     assert (clock(0.0, 1, lean=falling)[0] != 0.0) is steps
+
+
+def test_a_capture_point_is_believed_after_a_while_and_an_alarming_one_at_once():
+    def steps(forward: float) -> int:
+        falling = STILL._replace(forward=torch.tensor([[forward]]))
+        steady, phase = torch.zeros(1, 2), torch.zeros(1, 1)
+        for tick in range(50):
+            steady = GAIT.steady(steady, falling)
+            phase = GAIT.advance(phase, NONE, falling, steady)
+            if phase.item():
+                return tick
+        return -1
+
+    assert steps(STRIDE.ahead * STRIDE.alarm * 1.05) == 0
+    assert 2 <= steps(STRIDE.ahead * 1.5) <= 10  # -ln(1 - 1 / 1.5) = 1.1 of the patience
+    assert steps(STRIDE.ahead * 0.95) == -1
+
+
+def test_noise_of_the_size_of_the_feet_starts_no_step():
+    noise = torch.randn(500, generator=torch.Generator().manual_seed(0)) * STRIDE.ahead / 2
+    steady, phase, raw = torch.zeros(1, 2), torch.zeros(1, 1), 0
+    for n in noise:
+        leaning = STILL._replace(forward=n.reshape(1, 1))
+        steady = GAIT.steady(steady, leaning)
+        phase = GAIT.advance(phase, NONE, leaning, steady)
+        raw += n.abs().item() > STRIDE.ahead
+    assert phase.item() == 0.0 and raw > 10
 
 
 @pytest.mark.parametrize(("speed", "lifted"), [(1.0, "right"), (-1.0, "left")])

@@ -21,7 +21,7 @@ def standing(pitch: float = 0.0, pitch_rate: float = 0.0, label: str = "stand", 
     pose = GRAPH.references.goal(skill, torch.tensor([[phase]]))
     gravity = torch.tensor([[np.sin(pitch), 0.0, -np.cos(pitch)]], dtype=torch.float32)
     return Signals(pose, torch.zeros(1, JOINTS), gravity, torch.tensor([[0.0, pitch_rate, 0.0]]), skill, GRAPH.home,
-                   torch.tensor([[phase]]), pose, torch.zeros(1, 3), torch.zeros(1, 1), pose,
+                   torch.tensor([[phase]]), pose, torch.zeros(1, 3), torch.zeros(1, 1), torch.zeros(1, 2), pose,
                    torch.zeros(1, len(GRAPH.driven)))  # fmt: skip
 
 

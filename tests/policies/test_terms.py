@@ -22,14 +22,14 @@ def signals(seed: int = 0) -> Signals:
     gravity = torch.nn.functional.normalize(random(3), dim=-1)
     once = torch.rand(N, 2, generator=g)
     return Signals(random(JOINTS), random(JOINTS), gravity, random(3), torch.eye(LABELS), torch.zeros(JOINTS), once[:, :1],
-                   random(JOINTS), random(3), once[:, 1:], random(JOINTS), random(DRIVEN))  # fmt: skip
+                   random(JOINTS), random(3), once[:, 1:], random(2), random(JOINTS), random(DRIVEN))  # fmt: skip
 
 
 def tick(**changes: np.ndarray) -> Tick:
     """A robot that stands exactly where it should."""
     zeros = lambda k: np.zeros((N, k))  # noqa: E731
-    perfect = Tick(zeros(JOINTS), zeros(JOINTS), np.tile([0.0, 0.0, -1.0], (N, 1)), zeros(2), zeros(3), zeros(3), np.full(N, 0.78),
-                   np.full(N, 0.78), zeros(JOINTS), zeros(JOINTS), zeros(JOINTS))  # fmt: skip
+    perfect = Tick(zeros(JOINTS), zeros(JOINTS), np.tile([0.0, 0.0, -1.0], (N, 1)), zeros(2), zeros(3), zeros(3), np.ones(N),
+                   np.full(N, 0.78), np.full(N, 0.78), zeros(JOINTS), zeros(JOINTS), zeros(JOINTS))  # fmt: skip
     return perfect._replace(**changes)
 
 
@@ -72,6 +72,7 @@ def test_reward_is_one_for_a_robot_that_does_everything_right():
         ("legs", {"joint_pos": np.eye(N, JOINTS)}),
         ("upright", {"gravity_in_base": np.tile([0.3, 0.0, -0.95], (N, 1))}),
         ("height", {"height": np.full(N, 0.6)}),
+        ("rest", {"resting": np.zeros(N)}),
         ("velocity", {"velocity": np.full((N, 2), 0.5)}),
         ("velocity", {"command": np.full((N, 3), 0.5)}),
         ("turn", {"angular_velocity_base_in_base": np.tile([0.0, 0.0, 0.5], (N, 1))}),
