@@ -24,6 +24,7 @@ BENCHES = (
     "policy",
     "rate",
     "lockstep",
+    "env",
     "walk",
     "loop",
 )  # tools/bench_<name>.py, each with rows()
@@ -34,7 +35,7 @@ class Args:
     """Which benchmarks to run, and where to write the figures."""
 
     only: tyro.conf.Positional[tuple[str, ...]] = field(default=BENCHES)
-    """Benchmarks to run: codec unitree dynamixel policy rate lockstep walk loop."""
+    """Benchmarks to run: codec unitree dynamixel policy rate lockstep env walk loop."""
     json: Path = Path("runs/bench.json")
     """The same figures for a program to read."""
 

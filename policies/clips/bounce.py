@@ -35,10 +35,10 @@ SETTLING = 3  # strokes before the one that is kept: then inverse kinematics has
 class Stroke:
     """One bounce, at the size of the robot."""
 
-    peak: float = 0.88  # m, the ball's centre where the palm finds it
-    push: float = 0.15  # m that the palm stays on it
-    follow: float = 0.12  # m in which the palm then comes to rest
-    place: tuple[float, float] = (0.27, 0.3)  # m from the base: ahead, and to the side of the arm
+    peak: float = 1.0  # m, the ball's centre where the palm finds it
+    push: float = 0.2  # m that the palm stays on it
+    follow: float = 0.3  # m in which the palm then comes to rest
+    place: tuple[float, float] = (0.3, 0.27)  # m from the base: ahead, and to the side of the arm
     knees: float = 0.35  # rad, bent: as the robot stands at home
 
 

@@ -16,7 +16,7 @@ from policies.clips.resample import resample
 from policies.clips.robot import POINT_NAMES, RobotBody
 from policies.contact_graph import ContactGraph, reference_edges
 from policies.skillmimic.config import SkillMimic
-from policies.skillmimic.plan import GRAVITY, Rows
+from policies.skillmimic.plan import GRAVITY, TIPS, Rows
 from policies.skillmimic.rewards import Motion
 from policies.skillmimic.stance import crouched, stand, trunk
 
@@ -145,10 +145,14 @@ class ReferenceClips:
         velocity = rotate(turn, m.object_velocity[at] - m.points_velocity[at, 0])
         target = (self.target[at] + self._lag * m.joint_vel[at])[:, acting]
         pulls = pull * (m.contact[at, 0] == 0)
+        if self.loop[
+            clip
+        ]:  # a stroke once begun is finished, whatever the ball makes of it; its return says when the next is
+            pulls *= velocity[:, 2] > 0
         if self.swing[clip]:
             target, ball_in_base = self.mean(skill)[0][None, acting], ball_in_base.mean(axis=0, keepdims=True)
             velocity, pulls = np.zeros((1, 3)), np.zeros(1)
-        data, back = mujoco.MjData(self._model), np.zeros((len(target), len(acting), 4))
+        data, back = mujoco.MjData(self._model), np.zeros((len(target), len(acting), TIPS.stop))
         for t in range(len(target)):
             if gone[t]:
                 continue
@@ -158,8 +162,9 @@ class ReferenceClips:
             for site in self._body.palms[self.hands[clip]]:
                 link = self._model.site_bodyid[site]
                 moves, turns = _jacobian(self._model, data, data.site_xpos[site], link)[:, :, acting]
-                back[t, :, :3] += _inverse(moves)
-                back[t, :, 3:] += _inverse(np.concatenate([moves, LEVER * turns[1:2]]))[:, 3:] * LEVER
+                back[t, :, : TIPS.start] += _inverse(moves)
+                tips = LEVER * np.array([turns[1], -turns[0]])
+                back[t, :, TIPS] += _inverse(np.concatenate([moves, tips]))[:, TIPS] * LEVER
         return Rows(target, ball_in_base, velocity, back, bool(self.loop[clip]), pulls)
 
     def _gone(self, clip: int, at: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ class SkillMimic:
     swing: tuple[str, ...] = ("hold", "carry")  # skills whose clips play to and fro; others end
     loop: tuple[str, ...] = ("dribble_in_place",)  # skills whose clips begin again where they end
     after: float = 1.0  # s that an episode goes on beyond the end of a clip, at its last frame
+    practise: tuple[str, ...] = ()  # only these of the skills, for now; none: all
     anywhere: bool = True  # episodes start anywhere in a clip, not only at its beginning
     variant: str = "skillmimic"  # see rewards.VARIANTS
     sensitivity: str = "robot"  # see rewards.SENSITIVITIES
@@ -36,7 +37,6 @@ class SkillMimic:
     )
     hidden: tuple[int, ...] = (256, 128)
     action_ratio: float = 0.25  # action 1 moves the target by this share of torque / kp
-    legs: float = 0.0  # of legs and waist that a base moves, the share that the actor adds to what that says
     action_max: float = 6.0
     grip: float = (
         30.0  # N each palm presses, where the clip has both on the ball: inside the posture actions start from

@@ -31,6 +31,7 @@ from policies.skillmimic.stance import arms, moved
 from policies.skillmimic.starts import thrown
 from policies.skillmimic.terminations import failed, up
 from sim2real.object.scene import AIMING
+from sim2real.types import Sim2realError
 
 BASE, JOINTS, BALL = slice(0, 7), slice(7, -7), slice(-7, -4)  # of qpos
 SPIN, RATES, FLIGHT = slice(3, 6), slice(6, -6), slice(-6, -3)  # of qvel
@@ -46,13 +47,16 @@ class Env(VecEnv):
     level = None  # no push curriculum here
 
     def __init__(self, config: SkillMimic, seed: int, graph: PolicyGraph | None = None, skill: str = "") -> None:
-        """``skill``: only this one of the policy's."""
+        """``skill``: only this one of the policy's, whatever ``config.practise`` says."""
         self.cfg = self.config = config
         self.device = "cpu"
         self.graph = graph or PolicyGraph(config)
         self.model, self.contacts, self.clips = self.graph.model, self.graph.contact_graph, self.graph.clips
         self.sensitivity = SENSITIVITIES[config.sensitivity]
-        self.skills = [k for k, name in enumerate(config.skills) if skill in ("", name)]
+        chosen = (skill,) if skill else config.practise or config.skills
+        if strangers := [name for name in chosen if name not in config.skills]:
+            raise Sim2realError(f"practise: got '{strangers[0]}', expected some of {', '.join(config.skills)}")
+        self.skills = [k for k, name in enumerate(config.skills) if name in chosen]
         self.rng = np.random.default_rng(seed)
         self.num_envs = n = config.envs
         self.num_actions, joints = len(self.graph.acting), len(self.graph.joint_names)
@@ -212,8 +216,8 @@ class Env(VecEnv):
         if self.graph.base is not None:
             trunk, stance = (self._bodies[:, self._trunk], self._turns[:, self._trunk]), self.clips.skill[self.clip]
             there = self.clips.trunk_position[stance], self.clips.trunk_orientation[stance]
-            state = arms(moved(state, qvel, trunk, there), self.graph.arms)
-            acceleration = acceleration[:, self.graph.arms]
+            state = arms(moved(state, qvel, trunk, there), self.graph.acting)
+            acceleration = acceleration[:, self.graph.acting]
         away = lambda there, here: np.where(gone[:, None], here, there)  # noqa: E731
         reference = reference._replace(
             object_position=away(reference.object_position, state.object_position),
@@ -225,7 +229,7 @@ class Env(VecEnv):
     def reference(self, rows: np.ndarray, way: np.ndarray) -> Motion:
         """What is imitated at table ``rows`` (N,), as ``_judge`` sees states."""
         motion = self.clips.motion(rows, way)
-        return motion if self.graph.base is None else arms(motion, self.graph.arms)
+        return motion if self.graph.base is None else arms(motion, self.graph.acting)
 
     def _observe(self) -> None:
         """Measure every robot; what its actor sees this tick, and what only the critic sees."""
@@ -349,7 +353,7 @@ class Env(VecEnv):
             self.carries["carry_clock"][ids] = _tensor(
                 np.where(self.clips.swing[clip], 0.0, self.row[ids] / self.substeps)[:, None]
             )
-            self.carries["carry_arms"][ids] = self.target[ids][:, self.graph.arms]
+            self.carries["carry_arms"][ids] = self.target[ids][:, self.graph.acting]
             # whose arms are where they are sent
             self.carries["carry_base_posture"][ids] = torch.where(
                 self.graph.acts > 0, self.target[ids], _tensor(self.clips.stances[self.clips.skill[self.clip[ids]]])

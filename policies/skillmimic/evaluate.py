@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -135,17 +135,19 @@ def evaluate(
     graph: PolicyGraph,
     episodes: int,
     seconds: float,
+    skills: Sequence[str] = (),
     push: float = 0.0,
     seed: int = 0,
     act: Callable[[Env], Tensor] | None = None,
 ) -> dict[str, Result]:
-    """Of every skill, ``episodes`` of ``seconds`` from the beginning of a clip (a clip that ends is over ``config.after`` s
+    """Of every skill (of ``skills``), ``episodes`` of ``seconds`` from the beginning of a clip (a clip that ends is over ``config.after`` s
     after its end), with robots and balls drawn from randomisation that training never saw.
 
     ``push``: m/s, the largest of random pushes. ``act``: what to do, (episodes, actions); by default what ``graph.actor``
     says.
     """
-    return {skill: evaluate_skill(graph, skill, episodes, seconds, push, seed, act) for skill in graph.config.skills}
+    chosen = skills or graph.config.skills
+    return {skill: evaluate_skill(graph, skill, episodes, seconds, push, seed, act) for skill in chosen}
 
 
 def evaluate_skill(

@@ -56,9 +56,7 @@ class PolicyGraph(nn.Module):
         self.body = RobotBody.of(robot)
         self.base: policies.graph.PolicyGraph | None = graph_of(ROOT / config.base) if config.base else None
         acts = np.array([self.base is None or j.group == "arm" for j in robot.joints])
-        share = np.where(acts, config.action_ratio, config.legs)
-        self.arms = np.flatnonzero(acts).tolist()  # that follow the plan; every joint where there is none
-        self.acting = np.flatnonzero(share).tolist()
+        self.acting = np.flatnonzero(acts).tolist()  # the arms, which follow the plan; every joint where there is none
         crouch = None
         if self.base is not None:
             self.base.requires_grad_(False)
@@ -69,19 +67,21 @@ class PolicyGraph(nn.Module):
         means = [self.clips.mean(k) for k in range(len(self.labels))]
         self.register_buffer("postures", _buffer(np.stack([posture for posture, _ in means])))
         self.register_buffer("lean", _buffer(np.stack([gravity[:1] for _, gravity in means])))
-        scale = share * robot.torque_max / self.kp
+        scale = acts * config.action_ratio * robot.torque_max / self.kp
         self.register_buffer("scale", _buffer(scale))
         self.register_buffer("drive", _buffer(np.diag(scale)[self.acting]))  # actions to joints
         self.register_buffer("ankles", _buffer(np.array(["ankle_pitch" in name for name in robot.joint_names])))
         self.register_buffer("acts", _buffer(acts))
         self.plan: Plan  # where there is a base
         if self.base is not None:
-            rows = [self.clips.plan(k, self.arms, PULL * (name in config.timed)) for k, name in enumerate(self.labels)]
-            self.plan = Plan(rows, corrections(config.corrections, self.labels, len(self.arms)))
+            rows = [
+                self.clips.plan(k, self.acting, PULL * (name in config.timed)) for k, name in enumerate(self.labels)
+            ]
+            self.plan = Plan(rows, corrections(config.corrections, self.labels, len(self.acting)))
             self.register_buffer("ahead", torch.eye(2, 3))  # forwards and left, to a command
             labels = list(self.base.labels)
             self.register_buffer("gaits", torch.eye(len(labels))[[labels.index("walk"), labels.index("stand")]])
-            self.register_buffer("spread", _buffer(np.eye(len(acts))[self.arms]))  # arms to joints
+            self.register_buffer("spread", _buffer(np.eye(len(acts))[self.acting]))  # arms to joints
         self.register_buffer("poses", _buffer(self.clips.stances - robot.home_pos))  # (skills, n), of the base
         self.register_buffer("walks", _buffer(np.array([[skill in config.walks] for skill in config.skills])))
         self.register_buffer("lower", _buffer(robot.position_min + config.position_margin))
@@ -119,7 +119,7 @@ class PolicyGraph(nn.Module):
     def carry_start(self) -> dict[str, list[float]]:
         """What each carried tensor is before the first tick; an empty list is zeros."""
         start = torch.where(self.acts > 0, self.postures[0], _buffer(self.clips.stances[0]))
-        known = {"carry_base_posture": start.tolist(), "carry_arms": start[self.arms].tolist()}
+        known = {"carry_base_posture": start.tolist(), "carry_arms": start[self.acting].tolist()}
         return {n: known.get(n, []) for n in self.inputs() if n.startswith("carry_")}
 
     def inputs(self) -> dict[str, list[int]]:
@@ -140,7 +140,7 @@ class PolicyGraph(nn.Module):
             **(
                 {}
                 if self.base is None
-                else {"carry_skill": [len(self.labels)], "carry_clock": [1], "carry_arms": [len(self.arms)]}
+                else {"carry_skill": [len(self.labels)], "carry_clock": [1], "carry_arms": [len(self.acting)]}
             ),
             **{_of_base(name): shape for name, shape in base.items() if name.startswith("carry_")},
         }

@@ -26,14 +26,14 @@ from policies.skillmimic.config import TASKS, SkillMimic
 from policies.skillmimic.env import Env
 from policies.skillmimic.evaluate import ticks_of
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.plan import KNOTS, REACH, ROOT, Correction
+from policies.skillmimic.plan import KNOTS, REACH, ROOT, TIPS, Correction
 
 with warnings.catch_warnings():  # that there is no matplotlib
     warnings.simplefilter("ignore", UserWarning)
     import cma
 
 # What is one unit of the search: rad; m, rad, m/s per m; the same per m/s.
-OFFSET, GAIN, DAMP = 0.1, np.repeat([0.4, 0.8, 1.0], [3, 1, 2]), np.repeat([0.04, 0.3, 0.3], [3, 1, 2])
+OFFSET, GAIN, DAMP = 0.1, np.repeat([0.4, 0.8, 1.0], [3, 2, 2]), np.repeat([0.04, 0.3, 0.3], [3, 2, 2])
 SIGMA = 0.3  # of the first generation, in those units
 QUIET = 1.3  # strokes without a touch, after which a ball is not being dribbled
 
@@ -49,7 +49,7 @@ class Search:
         clip = int(np.flatnonzero(graph.clips.skill == skill)[0])
         still = bool(graph.clips.swing[clip])
         self.count = 1 if still else KNOTS
-        names = [graph.joint_names[j] for j in graph.arms]
+        names = [graph.joint_names[j] for j in graph.acting]
         self.order, sign = joint_mirror(names)
         self.sign = np.array(sign)
         both = bool(graph.clips.hands[clip].all())
@@ -58,7 +58,9 @@ class Search:
         self.both = both
         # Palms tip, and the base walks, only after a ball that comes back again and again.
         chases = bool(graph.clips.loop[clip])
-        self.unit = np.concatenate([unit * np.repeat([1.0, chases], [3, 3]) for unit in (GAIN, DAMP)])
+        self.unit = np.concatenate(
+            [unit * np.repeat([1.0, chases], [TIPS.start, len(REACH) - TIPS.start]) for unit in (GAIN, DAMP)]
+        )
 
     def offsets(self, x: np.ndarray) -> np.ndarray:
         """(..., KNOTS, arms) rad of vectors (..., size)."""
@@ -70,7 +72,7 @@ class Search:
         return np.broadcast_to(own, (*x.shape[:-1], KNOTS, arms))
 
     def gains(self, x: np.ndarray) -> np.ndarray:
-        """(..., 12) of vectors (..., size)."""
+        """(..., 14) of vectors (..., size)."""
         return x[..., -2 * len(REACH) :] * self.unit
 
     def correction(self, x: np.ndarray) -> Correction:
@@ -152,7 +154,7 @@ def optimise(
     env = Env(dataclasses.replace(config, frames=ticks), seed, graph)
     env.rng = Alike(seed, each, candidates)
     search = Search(graph, 0)
-    start = search.vector(plan.read(config.corrections, [skill], len(graph.arms))[0])
+    start = search.vector(plan.read(config.corrections, [skill], len(graph.acting))[0])
     options = {"popsize": candidates - 1, "seed": seed + 1, "verbose": -9, "CMA_diagonal": 15}
     es = cma.CMAEvolutionStrategy(start, SIGMA, options)
     began = time.monotonic()

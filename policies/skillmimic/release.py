@@ -24,7 +24,7 @@ from sim2real.policy import Policy
 from sim2real.types import Sim2realError
 
 SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "walks", "corrections", "timed", "period",
-            "timestep", "action_ratio", "legs", "action_max", "grip", "balance_gain", "balance_damping", "position_margin",
+            "timestep", "action_ratio", "action_max", "grip", "balance_gain", "balance_damping", "position_margin",
             "history", "frames", "throw", "terminations")  # fmt: skip
 SHOWN, NONE = (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)  # m/s, m/s, rad/s: commands of a timeline that names none
 GOLDEN_STEPS, GOLDEN = 40, 4  # ticks of each golden sequence, and how many

@@ -104,8 +104,8 @@ class Judge:
         if graph.base is not None:
             stance = clips.skill[[self.clip]]
             there = clips.trunk_position[stance], clips.trunk_orientation[stance]
-            state = arms(moved(state, qvel, body.trunk(), there), graph.arms)
-            reference = arms(reference, graph.arms)
+            state = arms(moved(state, qvel, body.trunk(), there), graph.acting)
+            reference = arms(reference, graph.acting)
         else:
             self._laid = self._laid or _Laid.at(state, reference)
             state = self._laid(state)

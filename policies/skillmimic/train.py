@@ -34,7 +34,9 @@ class SkillTraining(training.Training):
     def evaluate(self) -> dict[str, float]:
         """The mean over skills, and each of them."""
         config = self.config
-        results = evaluate(self.graph(), config.evaluate_envs, config.evaluate_seconds, push=config.push_speed)
+        results = evaluate(
+            self.graph(), config.evaluate_envs, config.evaluate_seconds, config.practise, push=config.push_speed
+        )
         mean = lambda name: sum(getattr(r, name) for r in results.values()) / len(results)  # noqa: E731
         success = {skill: r.success.value for skill, r in results.items()}
         return {

@@ -17,7 +17,7 @@ class Args:
     """Train a policy in simulation: config, curve and checkpoints go to a folder, from which a second call resumes."""
 
     task: tyro.conf.Positional[str]
-    """what to train: g1-basics, g1-ball, g1-dribble or g1-pickup"""
+    """what to train: g1-basics, g1-ball or g1-pickup"""
     folder: Path | None = None
     """where the run lives; default: runs/<task>"""
     samples: float | None = None
@@ -30,6 +30,8 @@ class Args:
     """of everything random"""
     start: Path | None = None
     """begin from the networks of this checkpoint (policies/g1/basics.pt, say) instead of from nothing"""
+    practise: str | None = None
+    """of a policy for ball skills, only this one: dribble_in_place, say"""
     variant: Literal["skillmimic", "no_cgr", "no_multiplication", "deepmimic", "amp"] | None = None
     """of the reward for ball skills"""
 
@@ -38,6 +40,8 @@ def main(argv: list[str]) -> int:
     args = tyro.cli(Args, args=argv, prog="sim2real train")
     folder = args.folder or Path("runs") / args.task
     given = {k: getattr(args, k) for k in ("samples", "envs", "threads", "seed", "variant")}
+    if args.practise:
+        given["practise"] = (args.practise,)
     training_side("policies.train").train_command(
         args.task, folder, args.start, **{k: v for k, v in given.items() if v is not None}
     )

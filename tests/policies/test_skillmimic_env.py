@@ -19,6 +19,7 @@ from policies.skillmimic.starts import thrown
 from policies.skillmimic.terminations import TERMINATIONS
 from sim2real.contract import CARRY, INPUTS
 from sim2real.object.scene import AIMING
+from sim2real.types import Sim2realError
 
 CONFIG = SkillMimic(envs=8, threads=1, disturbed=0.0, push_chance=0.0)
 MIXED = dataclasses.replace(CONFIG, skills=("hold", "pass", "pickup"), clips=())
@@ -333,20 +334,20 @@ def test_a_base_that_is_told_nothing_keeps_its_feet_on_the_floor(catches):
     assert [labels[k] for k in catches.gait(told).argmax(dim=1)] == ["stand", "stand", "walk"]
 
 
-def test_an_actor_that_helps_the_legs_adds_to_what_the_base_says():
-    graph = PolicyGraph(dataclasses.replace(CATCH, legs=0.1))
-    env = Env(graph.config, 1, graph)
-    assert env.num_actions == len(graph.joint_names) and len(graph.arms) == 14
-    knee, elbow = (graph.joint_names.index(f"left_{n}_joint") for n in ("knee", "elbow"))
-    action = torch.zeros(1, env.num_actions)
-    action[0, graph.acting.index(knee)] = action[0, graph.acting.index(elbow)] = 1.0
-    one = {name: value[:1] for name, value in (*env.inputs.items(), *env.carries.items())}
-    seen = graph.signals(**one)
-    moved = (graph.target(seen, action) - graph.target(seen, 0 * action))[0]
-    for joint, share in ((knee, 0.1), (elbow, graph.config.action_ratio)):
-        limit = graph.robot.torque_max[joint] / graph.kp[joint]
-        assert float(moved[joint]) == pytest.approx(share * limit, rel=1e-4)
-    assert int((moved.abs() > 1e-6).sum()) == 2
-    with_help = graph.signals(**(one | {"carry_action": action}))  # the base hears of the arms alone: it feels its legs
-    pose = with_help.carried["carry_base_posture"] - seen.carried["carry_base_posture"]
-    assert float(pose[0, elbow].abs()) > 0 and float(pose[0, knee]) == pytest.approx(0.0, abs=1e-6)
+def test_an_actor_moves_the_arms_and_nothing_else(catches):
+    env = Env(catches.config, 1, catches)
+    seen = catches.signals(**{name: value[:1] for name, value in (*env.inputs.items(), *env.carries.items())})
+    moved = (
+        catches.target(seen, torch.ones(1, env.num_actions)) - catches.target(seen, torch.zeros(1, env.num_actions))
+    )[0]
+    arms = torch.tensor([j.group == "arm" for j in catches.robot.joints])
+    assert (moved[arms].abs() > 1e-6).all() and not moved[~arms].any()
+
+
+def test_a_policy_practises_one_of_its_skills():
+    task = dataclasses.replace(TASKS["g1-ball"], envs=16, threads=1, practise=("pass",))
+    graph = PolicyGraph(task)
+    assert (Env(task, 1, graph).skill.argmax(dim=1) == graph.labels.index("pass")).all()
+    assert (Env(task, 1, graph, "hold").skill.argmax(dim=1) == graph.labels.index("hold")).all()
+    with pytest.raises(Sim2realError, match="got 'juggle', expected some of hold, carry"):
+        Env(dataclasses.replace(task, practise=("juggle",)), 1, graph)

@@ -17,25 +17,26 @@ from policies.skillmimic.config import TASKS
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PULL, PolicyGraph
 from policies.skillmimic.optimise import Search, optimise, score, write
-from policies.skillmimic.plan import APPROACH, KNOTS, REACH, Correction, Plan, Rows, read, samples
+from policies.skillmimic.plan import APPROACH, KNOTS, REACH, TIPS, Correction, Plan, Rows, read, samples
 from sim2real.types import Sim2realError
 
 ARMS, T = 2, 8
 NONE = [0.0] * len(REACH)
 
 
-def axis(up: float, tip: float = 0.0, pace: float = 0.0) -> list[float]:
-    """Gains of what moves up, of the tipping, and of the base's pace forwards."""
-    return [0.0, 0.0, up, tip, pace, 0.0]
+def axis(up: float, tip: float = 0.0, pace: float = 0.0, aside: float = 0.0) -> list[float]:
+    """Gains of what moves up, of the tipping forwards and aside, and of the base's pace forwards."""
+    return [0.0, 0.0, up, tip, aside, pace, 0.0]
 
 
 def rows(loop: bool = False, pull: float = 0.0) -> Rows:
     """A ball that flies forwards at 1 m/s, 2 cm a row, and one joint that follows the row's number."""
     t = np.arange(T)
     ball = np.column_stack([t * 0.02, np.zeros(T), np.zeros(T)])
-    back = np.zeros((T, ARMS, 4))
+    back = np.zeros((T, ARMS, 5))
     back[:, 1, 2] = 2.0  # a metre up is two radians of the second joint
-    back[:, 0, 3] = 1.0  # the first one tips the palm
+    back[:, 0, 3] = 1.0  # the first one tips the palm forwards,
+    back[:, 1, 4] = 1.0  # and the second to the left
     return Rows(
         np.column_stack([t * 0.1, np.zeros(T)]), ball, np.tile([1.0, 0, 0], (T, 1)), back, loop, np.full(T, pull)
     )
@@ -116,6 +117,9 @@ def test_palms_tip_and_the_base_follows_a_ball_that_runs_ahead():
     p = at(plan, 3.0, [0.08 + 0.05, 0.0, 0.0, 1.1, 0.0, 0.0])
     np.testing.assert_allclose(p.target, [[0.4 + 2.0 * 0.05, 0.0]], atol=1e-6)
     np.testing.assert_allclose(p.pace, [[3.0 * 0.05 + 0.1, 0.0]], atol=1e-6)
+    aside = Plan([rows()], [correction(follow=axis(0.0, aside=2.0))])
+    p = at(aside, 3.0, [0.08, 0.05, 0.0, 1.0, 0.0, 0.0])
+    np.testing.assert_allclose(p.target, [[0.4, 2.0 * 0.05]], atol=1e-6)
 
 
 def test_arms_come_slowly_to_where_a_skill_begins_and_follow_it_at_once_from_there():
@@ -136,7 +140,9 @@ def test_palms_do_not_follow_a_ball_that_the_plan_still_waits_for():
 
 def test_what_was_found_is_read_back(tmp_path):
     path = tmp_path / "plan.yaml"
-    some = Correction(np.round(np.random.default_rng(0).normal(size=(KNOTS, ARMS)), 4), np.ones(6), np.zeros(6))
+    some = Correction(
+        np.round(np.random.default_rng(0).normal(size=(KNOTS, ARMS)), 4), np.ones(len(REACH)), np.zeros(len(REACH))
+    )
     write(path, "catch", some, 10)
     write(path, "catch", some, 5)
     write(path, "pass", correction())
@@ -159,7 +165,7 @@ def graph():
 
 
 def test_both_arms_are_corrected_alike_but_for_a_dribble(graph):
-    names = [graph.joint_names[j] for j in graph.arms]
+    names = [graph.joint_names[j] for j in graph.acting]
     for label in graph.labels:
         search = Search(graph, graph.labels.index(label))
         size = search.count * int(search.free.sum()) + 2 * len(REACH)
@@ -169,7 +175,7 @@ def test_both_arms_are_corrected_alike_but_for_a_dribble(graph):
         assert search.count == (1 if label in graph.config.swing else KNOTS)
         expected = np.arange(1.0, size + 1)
         if label != "dribble_in_place":  # palms tip, and the base walks, only after a ball that comes again and again
-            expected[-9:-6] = expected[-3:] = 0.0
+            expected[-11:-7] = expected[-4:] = 0.0
         np.testing.assert_allclose(search.vector(c), expected, atol=1e-9)
 
 
@@ -224,3 +230,24 @@ def test_arms_are_told_of_the_weight_of_the_ball_and_of_what_speeds_it_up(graph)
         up += np.linalg.pinv(jacobian[:, 6:-6] * arms) @ [0.0, 0.0, 1.0]
     assert (held - empty) @ up == pytest.approx(MASS * 9.81, rel=1e-3)
     assert (falling - empty) @ up == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_tipped_palm_turns_and_stays_where_it_is(graph):
+    """Of the dribbling hand: what is pushed back is a ball ahead and a ball to the left."""
+    k, body = graph.labels.index("dribble_in_place"), graph.body
+    clip = int(np.flatnonzero(graph.clips.skill == k)[0])
+    row = graph.clips.plan(k, graph.acting, 0.0).back[0]
+    data = mujoco.MjData(graph.model)
+    normals, places = [], []
+    for tips in ([0.0, 0.0], [0.05, 0.0], [0.0, 0.05]):
+        data.qpos[:] = graph.clips.qpos[graph.clips.first[clip]]
+        data.qpos[7 + np.array(graph.acting)] += row[:, TIPS] @ tips
+        mujoco.mj_kinematics(graph.model, data)
+        site = body.palms[1]
+        normals.append(data.site_xmat[site].reshape(3, 3)[:, 2].copy())
+        places.append(data.site_xpos[site].copy())
+    flat, forwards, left = normals
+    assert flat[2] < -0.98  # the palm looks down
+    np.testing.assert_allclose((forwards - flat)[:2], [-0.05, 0.0], atol=0.015)
+    np.testing.assert_allclose((left - flat)[:2], [0.0, -0.05], atol=0.015)
+    assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 0.005
