@@ -32,22 +32,19 @@ corrections, and nothing presses the ball, so that this has to be learned. Succe
 variants by. Acc., E_o and E_cg as in the paper's section 6.2."""
 
 
-def config_of(task: str, skill: str, variant: str, seed: int, samples: float) -> SkillMimic:
-    """The task's settings, with one skill and one reward. Nothing is selected: the last checkpoint counts."""
-    config = TASKS[task]
-    clips = tuple(c for c in config.clips if c.rsplit("_", 1)[0] == skill)
+def bare(task: str, seed: int, samples: float) -> SkillMimic:
+    """The task's settings with a plan that is the bare clip. Nothing is selected: the last checkpoint counts."""
     return dataclasses.replace(
-        config,
-        skills=(skill,),
-        clips=clips,
-        corrections=None,
-        grip=0.0,
-        variant=variant,
-        sensitivity=variant if variant in SENSITIVITIES else config.sensitivity,
-        seed=seed,
-        samples=samples,
-        evaluate_every=10**9,
+        TASKS[task], corrections=None, grip=0.0, seed=seed, samples=samples, evaluate_every=10**9
     )
+
+
+def config_of(task: str, skill: str, variant: str, seed: int, samples: float) -> SkillMimic:
+    """The same, with one skill and one reward."""
+    config = bare(task, seed, samples)
+    clips = tuple(c for c in config.clips if c.rsplit("_", 1)[0] == skill)
+    sensitivity = variant if variant in SENSITIVITIES else config.sensitivity
+    return dataclasses.replace(config, skills=(skill,), clips=clips, variant=variant, sensitivity=sensitivity)
 
 
 def train(config: SkillMimic, folder: Path) -> None:
