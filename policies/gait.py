@@ -38,9 +38,9 @@ class Stride:
     ahead: float = 0.07  # rad of the capture point beyond which a step is needed: forwards,
     behind: float = 0.08  # backwards,
     aside: float = 0.11  # and sideways
-    calm: float = 0.7  # share of these below which the clock may rest
-    patience: float = 0.1  # s over which the capture point is averaged before that counts, for speeds are noisy ...
-    alarm: float = 2.5  # ... unless it is so many times as far
+    calm: float = 0.5  # share of these below which the clock may rest
+    patience: float = 0.06  # s over which the capture point is averaged before that counts, for speeds are noisy ...
+    alarm: float = 1.5  # ... unless it is so many times as far
     acceleration: float = 1.2  # m/s^2 (rad/s^2) of a command
     idle: float = 0.05  # m/s (rad/s): a smaller command is none
 

@@ -12,6 +12,14 @@ env            all of it together, many robots at once; what the critic sees
 amp            the discriminator of the AMP variant
 evaluate       the paper's measures
 stance         clips for robots whose legs a base policy moves
+plan           what the arms do before any network: a clip's targets, corrections and linear feedback
+optimise       finds the corrections, by CMA-ES
+starts         where a skill starts: posture, place and flight of the ball
+sight          the ball as a tracker sees it
 train          the training run: sim2real train g1-ball
+ablation       the paper's Table 1: every reward at equal samples
+mixture        the paper's Table 3: each skill alone, and all in one policy
 release        from a checkpoint to a policy file
+through_bytes  the same judges in the deployed loop
+card           all of it as a report; with tables, curves and film
 """
