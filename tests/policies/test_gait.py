@@ -79,14 +79,14 @@ def test_a_capture_point_is_believed_after_a_while_and_an_alarming_one_at_once()
 
 
 def test_noise_of_the_size_of_the_feet_starts_no_step():
-    noise = torch.randn(500, generator=torch.Generator().manual_seed(0)) * STRIDE.ahead / 2.5
+    noise = torch.randn(500, generator=torch.Generator().manual_seed(0)).clamp(-2.8, 2.8) * STRIDE.ahead / 2
     steady, phase, raw = torch.zeros(1, 2), torch.zeros(1, 1), 0
     for n in noise:
         leaning = STILL._replace(forward=n.reshape(1, 1))
         steady = GAIT.steady(steady, leaning)
         phase = GAIT.advance(phase, NONE, leaning, steady)
         raw += n.abs().item() > STRIDE.ahead
-    assert phase.item() == 0.0 and raw > 3
+    assert phase.item() == 0.0 and raw > 10
 
 
 @pytest.mark.parametrize(("speed", "lifted"), [(1.0, "right"), (-1.0, "left")])
