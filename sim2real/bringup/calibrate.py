@@ -26,7 +26,7 @@ SPAN_TOLERANCE = 0.1  # rad by which a range between stops may differ from the Y
 REST = 0.02  # rad that a joint which is held still may move
 HOLD_TIME = 0.8  # s for which it is held at its upper end
 NEAR = 0.05  # rad from an end that is at it
-AWAY = 0.2  # rad from an end that is not
+AWAY, AWAY_SHARE = 0.2, 0.2  # rad from an end that is not, and the share of a short range that is as good
 QUIET_TIME, QUIET_VELOCITY = 1.0, 0.05  # s, rad/s: the robot hangs still
 TORQUE_SHARE = 0.03  # of a joint's torque that friction may hold, where the model says less
 SYMMETRY = 0.25  # rad between left and right, hanging
@@ -78,10 +78,11 @@ class Track:
     """Where a motor was while a hand moved its joint. ``turn``: rad that it jumps by where its count wraps.
 
     ``holds``: where it was held still, one after the other, once it had been moved at all: where it happened to be before
-    says nothing.
+    says nothing. ``away``: rad that are a move.
     """
 
     turn: float
+    away: float = AWAY
     low: float = np.inf  # rad
     high: float = -np.inf
     last: float = np.nan
@@ -100,10 +101,10 @@ class Track:
         if self.turn and abs(position - self.last) > self.turn / 2:
             self.jumped = position - self.last
         self.low, self.high, self.last = min(self.low, position), max(self.high, position), position
-        self._moved |= abs(position - self._first) > AWAY
+        self._moved |= abs(position - self._first) > self.away
         if not abs(position - self._anchor) <= REST:
             self._anchor, self._since = position, time
-        self._left |= bool(self.holds) and abs(position - self.holds[-1]) > AWAY
+        self._left |= bool(self.holds) and abs(position - self.holds[-1]) > self.away
         if self._moved and self._left and time - self._since >= HOLD_TIME:
             self.holds.append(position)
             self._left = False
@@ -142,7 +143,10 @@ def measure(
     index = config.joint_names.index(joint)
     position = config.joints[index].position
     expected = position[1] - position[0]
-    tracks = [Track(motors.turn[name]) for name in config.joint_names]
+    ranges = [j.position[1] - j.position[0] for j in config.joints]
+    tracks = [
+        Track(motors.turn[name], min(AWAY, AWAY_SHARE * r)) for name, r in zip(config.joint_names, ranges, strict=True)
+    ]
     end = clock.now() + timeout
     mine, reach = tracks[index], config.joints[index].reach
     while True:

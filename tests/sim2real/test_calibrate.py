@@ -153,9 +153,9 @@ def test_a_count_that_wraps_within_the_range_is_told():
     assert track.jumped == pytest.approx(-6.2)
 
 
-def track(*places: float) -> Track:
+def track(*places: float, **settings: float) -> Track:
     """Held at each of ``places`` for a second, and moved to the next at 1 rad/s."""
-    seen, time, here = Track(0.0), 0.0, places[0]
+    seen, time, here = Track(0.0, **settings), 0.0, places[0]
     for place in places:
         while abs(place - here) > 0.011:
             here += 0.01 if place > here else -0.01
@@ -175,6 +175,12 @@ def track(*places: float) -> Track:
 def test_only_ends_that_were_held_one_after_the_other_count(places, ends):
     """Where it was before it was moved does not: a leg that starts at its upper end has not been brought there."""
     assert track(*places).ends() == ends
+
+
+def test_a_stop_near_where_a_short_joint_hangs_counts():
+    """A G1's ankle rolls over 0.52 rad and may hang 0.15 rad from its stop."""
+    assert track(0.15, 0.0, 0.52, away=0.2 * 0.52).ends() == 1
+    assert track(0.15, 0.0, 0.52).ends() == 0
 
 
 @pytest.mark.parametrize(
