@@ -154,6 +154,7 @@ class PolicyEntry(Strict):
 
     file: str
     description: str = ""
+    unshown: list[str] = []  # labels that a default timeline leaves out: performed where they are asked for by name
 
 
 class RobotConfig(Strict):

@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -42,7 +43,7 @@ class Args:
     duration: float = 0.0
     """with --skill: seconds; default 10"""
     script: str = ""
-    """a timeline, as in "stand:3,squat:6,walk:5@0.5/0/0"; default: every skill in turn"""
+    """a timeline, as in "stand:3,squat:6,walk:5@0.5/0/0"; default: every skill in turn, but those that the robot's YAML has unshown"""
     operator: Literal["script", "keyboard"] = "script"
     """who picks the skill"""
     clock: Literal["realtime", "lockstep"] = "realtime"
@@ -84,7 +85,8 @@ def main(argv: list[str]) -> int:
     from sim2real.skills import SkillPlayer
 
     player = SkillPlayer(config, policies)
-    operator = _operator(args, player.labels, policies)
+    unshown = {label for entry in config.policies.values() for label in entry.unshown}
+    operator = _operator(args, player.labels, policies, unshown)
     record = None if args.no_record else _record_path(args.record, config.name)
     run = _lockstep if args.clock == "lockstep" else _realtime
     with contextlib.suppress(KeyboardInterrupt):
@@ -152,7 +154,7 @@ def _policies(args: Args, config: RobotConfig, console: Console):
     return policies
 
 
-def _operator(args: Args, labels: list[str], policies):
+def _operator(args: Args, labels: list[str], policies, unshown: Collection[str]):
     if args.operator == "keyboard":
         from sim2real.operators.keyboard import KeyboardOperator
 
@@ -163,7 +165,7 @@ def _operator(args: Args, labels: list[str], policies):
         steps = [Step(args.skill, args.duration or 10.0, args.velocity)]
     else:
         shown = {s.label: s.velocity for policy in policies for s in policy.contract.skills}
-        rest = (Step(label, 5.0, shown[label]) for label in labels[1:])
+        rest = (Step(label, 5.0, shown[label]) for label in labels[1:] if label not in unshown)
         steps = [Step(labels[0], 2.0), *rest, Step(labels[0], 2.0)]
     for step in steps:
         if step.skill not in labels:

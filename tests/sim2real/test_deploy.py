@@ -8,7 +8,9 @@ import pytest
 import tiny_policy
 
 from sim2real.cli import main
+from sim2real.cli.deploy import Args, _operator
 from sim2real.config import CONFIG_DIR, load_robot
+from sim2real.policy import load_policy
 
 
 @pytest.fixture
@@ -119,3 +121,15 @@ def test_a_robot_without_a_policy_is_told_how_to_get_its_first(deploy, tmp_path)
     code, _, err = deploy("--robot", tmp_path / "mine.yaml", "--clock", "lockstep")
     assert code == 2
     assert f"sim2real posture --robot {tmp_path / 'mine.yaml'}" in " ".join(err.split())
+
+
+def test_what_a_robot_has_unshown_is_performed_only_where_it_is_asked_for():
+    config = load_robot("g1")
+    entry = config.policies["ball"]
+    policy = load_policy(CONFIG_DIR.parents[1] / entry.file, config, trial=0)
+    labels = list(policy.contract.skill_labels)
+    assert set(entry.unshown) < set(labels)
+    shown = _operator(Args(robot="g1"), labels, [policy], entry.unshown).steps
+    assert [s.skill for s in shown] == [x for x in labels if x not in entry.unshown] + labels[:1]
+    asked = _operator(Args(robot="g1", skill=entry.unshown[0]), labels, [policy], entry.unshown).steps
+    assert [s.skill for s in asked] == entry.unshown
