@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from policies.gait import Stride
+
 LEGS, UPPER = slice(0, 12), slice(12, 29)
-IDLE = 0.05  # m/s (rad/s): a smaller command is none
 
 
 class Tick(NamedTuple):
@@ -43,7 +44,7 @@ def _near(error: np.ndarray, width: float) -> np.ndarray:
 
 def _rests(t: Tick) -> np.ndarray:
     """Whether the feet stay where they are, unless the robot is told to go somewhere."""
-    return np.maximum(t.resting, np.any(np.abs(t.command) > IDLE, axis=-1))
+    return np.maximum(t.resting, np.any(np.abs(t.command) > Stride.idle, axis=-1))
 
 
 REWARDS: dict[str, Reward] = {

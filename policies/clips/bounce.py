@@ -3,8 +3,8 @@
 A stroke begins where the ball stands still, at its peak: a palm on top of it pushes it down with one constant
 acceleration, leaves it, comes to rest, and is back when the ball is, which has bounced with its restitution. So the
 stroke repeats exactly, and palm and ball meet with no speed between them. The arm follows by inverse kinematics, which
-hardly minds how the hand is turned: a hand kept level swings a heavy shoulder, and that shakes the robot off its feet.
-On its way back the palm follows a cubic. Liu & Hodgins (2018), too, needed no recorded ball.
+keeps the palm down, but minds where the hand is ten times as much: to keep it level to the last degree would swing a heavy
+shoulder, and that shakes the robot off its feet. On its way back the palm follows a cubic. Liu & Hodgins (2018), too, needed no recorded ball.
 """
 
 from __future__ import annotations

@@ -54,6 +54,11 @@ def train(config: SkillMimic, folder: Path) -> None:
     run.run()
 
 
+def pooled(results: Sequence[Result]) -> Rate:
+    """All seeds' episodes."""
+    return Rate(sum(r.success.survived for r in results), sum(r.success.episodes for r in results))
+
+
 def between(results: Sequence[Result]) -> tuple[float, float]:
     """Mean success, and half its 95 % confidence interval over seeds (Student's t for 2 to 5 of them)."""
     values = np.array([r.success.value for r in results])
@@ -65,14 +70,13 @@ def table(found: dict[str, list[Result]]) -> str:
     """Markdown, a row a variant."""
     rows = []
     for variant, results in found.items():
-        pooled = Rate(sum(r.success.survived for r in results), sum(r.success.episodes for r in results))
         mean, half = between(results)
         acc, ball, edges = (
             np.mean([getattr(r, n) for r in results]) for n in ("accuracy", "ball_error", "contact_error")
         )
         seeds = ", ".join(f"{r.success.value:.0%}" for r in results)
         rows.append(
-            f"| `{variant}` | {VARIANTS[variant].equation} | {pooled} | {mean:.0%} +- {half:.0%} ({seeds}) | {acc:.3f} |"
+            f"| `{variant}` | {VARIANTS[variant].equation} | {pooled(results)} | {mean:.0%} +- {half:.0%} ({seeds}) | {acc:.3f} |"
             f" {ball:.3f} | {edges:.3f} |"
         )
     head = (
@@ -81,14 +85,27 @@ def table(found: dict[str, list[Result]]) -> str:
     return head + "\n".join(rows)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+def arguments(what: str | None, seeds: range, default: int) -> argparse.ArgumentParser:
+    """What every comparison asks for; ``what`` begins with a sentence that says which it is."""
+    parser = argparse.ArgumentParser(description=(what or "").partition("\n")[0])
     parser.add_argument("task", choices=[name for name, c in TASKS.items() if c.base])
-    parser.add_argument("skill")
-    parser.add_argument("--samples", type=float, default=0.3e6)
-    parser.add_argument("--seeds", type=int, choices=range(2, 6), default=3)
+    parser.add_argument("--samples", type=float, default=0.3e6, help="of a run with one skill")
+    parser.add_argument("--seeds", type=int, choices=seeds, default=default)
     parser.add_argument("--episodes", type=int, default=100, help="of each seed")
     parser.add_argument("--report", type=Path, help="Markdown to write the table to")
+    return parser
+
+
+def tell(text: str, report: Path | None, head: str, note: str) -> None:
+    """Print what came out, and write it to ``report`` under its head and note."""
+    print(f"\n{text}")
+    if report:
+        report.write_text(f"# {head}\n\n{note}\n\n{text}")
+
+
+def main() -> None:
+    parser = arguments(__doc__, range(2, 6), 3)
+    parser.add_argument("skill")
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
     a = parser.parse_args()
     if a.skill not in TASKS[a.task].skills:
@@ -102,9 +119,7 @@ def main() -> None:
             found[variant].append(evaluate_skill(load_graph(folder, "last.pt"), a.skill, a.episodes, SECONDS))
             print(f"{variant}, seed {seed}: {found[variant][-1].success}", flush=True)
     text = f"`{a.skill}`, {a.samples / 1e6:g} M samples a run, {a.seeds} seeds, {a.episodes} episodes each:\n\n{table(found)}\n"
-    print(f"\n{text}")
-    if a.report:
-        a.report.write_text(f"# {HEAD}\n\n{NOTE}\n\n{text}")
+    tell(text, a.report, HEAD, NOTE)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from drivers.sim.ball import NAME, add_ball
+from drivers.sim.ball import NAME, add_ball, palms
 from policies.clips.robot import RobotBody
 from policies.contact_graph import ContactGraph
 from sim2real.config import RobotConfig
@@ -13,16 +13,11 @@ from sim2real.config import RobotConfig
 EDGES = [("ball", "hands"), ("ball", "body"), ("body", "hands")]  # of the paper, in the order of Table 7
 
 
-def hands(body: RobotBody) -> tuple[str, ...]:
-    """Names of the geoms that are hands, left before right."""
-    return tuple(body.model.geom(int(g)).name for geoms in body.hand_geoms for g in geoms)
-
-
-def paper_graph(spec: mujoco.MjSpec, palms: tuple[str, ...]) -> ContactGraph:
+def paper_graph(spec: mujoco.MjSpec, hands: tuple[str, ...]) -> ContactGraph:
     """The three nodes of the paper: hands, body (every other solid geom of the robot) and ball."""
     solid = [g.name for g in spec.geoms if (g.contype or g.conaffinity) and g.parent.name != "world"]
-    rest = [name for name in solid if name not in (*palms, NAME)]
-    return ContactGraph({"hands": palms, "body": rest, "ball": (NAME,)}, EDGES)
+    rest = [name for name in solid if name not in (*hands, NAME)]
+    return ContactGraph({"hands": hands, "body": rest, "ball": (NAME,)}, EDGES)
 
 
 def training_world(
@@ -50,9 +45,8 @@ def training_world(
         motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
     for sensor in list(spec.sensors):
         spec.delete(sensor)  # the IMU's: its readings follow from qpos and qvel
-    palms = hands(body)
     add_ball(timestep)(spec)
-    graph = paper_graph(spec, palms)
+    graph = paper_graph(spec, palms(spec))
     graph.prepare(spec)
     model = spec.compile()
     names = tuple(model.joint(j).name for j in range(1, model.njnt - 1))

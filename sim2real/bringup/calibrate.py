@@ -142,8 +142,8 @@ def measure(
     config, clock = motors.config, motors.clock
     index = config.joint_names.index(joint)
     position = config.joints[index].position
-    expected = position[1] - position[0]
     ranges = [j.position[1] - j.position[0] for j in config.joints]
+    expected = ranges[index]
     tracks = [
         Track(motors.turn[name], min(AWAY, AWAY_SHARE * r)) for name, r in zip(config.joint_names, ranges, strict=True)
     ]
