@@ -45,6 +45,20 @@ class Stride:
     idle: float = 0.05  # m/s (rad/s): a smaller command is none
 
 
+# Which of a leg's joints do what, rad of each per rad of it.
+PARTS: dict[str, dict[str, float]] = {
+    "line": {"hip_pitch": 1.0, "knee": 0.5},  # thigh and shin are equally long
+    "raise": {"hip_pitch": -1.0, "knee": 2.0, "ankle_pitch": -1.0},
+    "forward": {"hip_pitch": -1.0, "ankle_pitch": 1.0},  # the sole stays level
+    "aside": {"hip_roll": 1.0, "ankle_roll": -1.0},
+    "turn": {"hip_yaw": 1.0},
+    "pitch": {"hip_pitch": 1.0},
+    "roll": {"hip_roll": 1.0},
+}
+MEASURED = "line", "roll"
+MOVED = "raise", "forward", "aside", "turn", "pitch", "roll"
+
+
 class Lean(NamedTuple):
     """How the base stands over its standing feet, each (N, 1): rad, and rad/s times the leg's length in m/s; and how the
     trunk is turned, rad."""
@@ -68,22 +82,16 @@ class Gait(nn.Module):
         super().__init__()
         self.stride, self.step = stride, period / stride.period
         self.period = period
-        self.loads: Tensor
-        self.register_buffer(
-            "loads", torch.zeros(2, len(joint_names)) if loads is None else torch.tensor(loads).float()
-        )
-        for side in ("left", "right"):
-            for what, parts in {
-                "line": {"hip_pitch": 1.0, "knee": 0.5},  # thigh and shin are equally long
-                "roll": {"hip_roll": 1.0},
-                "raise": {"hip_pitch": -1.0, "knee": 2.0, "ankle_pitch": -1.0},
-                "forward": {"hip_pitch": -1.0, "ankle_pitch": 1.0},  # the sole stays level
-                "aside": {"hip_roll": 1.0, "ankle_roll": -1.0},
-                "turn": {"hip_yaw": 1.0},
-                "pitch": {"hip_pitch": 1.0},
-            }.items():
-                row = [next((v for k, v in parts.items() if name == f"{side}_{k}_joint"), 0.0) for name in joint_names]
-                self.register_buffer(f"{side}_{what}", torch.tensor(row))
+        n = len(joint_names)
+        loads = torch.zeros(2, n) if loads is None else torch.tensor(loads).float()
+        legs = [[_row(joint_names, f"{side}_", PARTS[part]) for side in ("left", "right")] for part in PARTS]
+        of = dict(zip(PARTS, torch.tensor(legs), strict=True))  # part: (2, n), the left leg's and the right one's
+        self.lines: Tensor  # (n, 4)
+        self.register_buffer("lines", torch.cat([of[part] for part in MEASURED]).T.contiguous())
+        self.basis: Tensor  # (2 parts + 1 + 2, n): what steps do, by leg; both legs aside; what one leg bears
+        self.register_buffer("basis", torch.cat([*(of[part] for part in MOVED), of["aside"].sum(0)[None], loads]))
+        self.sides: Tensor
+        self.register_buffer("sides", torch.tensor([[-1.0, 1.0]]))
 
     def ramp(self, last: Tensor, command: Tensor) -> Tensor:
         """The command (N, 3) that is followed now: ``command``, approached at ``stride.acceleration``."""
@@ -93,22 +101,20 @@ class Gait(nn.Module):
     def lean(self, phase: Tensor, gravity: Tensor, gyro: Tensor, bend: Tensor, joint_vel: Tensor) -> Lean:
         """From the legs that stand: left, right or, at rest, both. ``gravity`` (N, 3) and ``gyro`` (N, 3) rad/s in the
         base, ``bend`` (N, n) rad of the joints from the pose that is stood in."""
-        left = torch.where(
-            self.resting(phase), 0.5, (phase > 0.5).to(phase.dtype)
-        )  # share of it that the left leg bears
-
-        def of(x: Tensor, what: str) -> Tensor:
-            parts = [(x @ getattr(self, f"{side}_{what}"))[:, None] for side in ("left", "right")]
-            return left * parts[0] + (1 - left) * parts[1]
-
+        left = torch.where(self.resting(phase), 0.5, (phase > 0.5).to(phase.dtype))  # what the left leg bears
+        shares = torch.cat([left, 1 - left, left, 1 - left], dim=-1)
+        line, roll = torch.split((bend @ self.lines * shares).unflatten(1, (2, 2)).sum(dim=-1), 1, dim=-1)
+        line_rate, roll_rate = torch.split(
+            (joint_vel @ self.lines * shares).unflatten(1, (2, 2)).sum(dim=-1), 1, dim=-1
+        )
         leg = self.stride.leg
         return Lean(
-            gravity[:, 0:1] + of(bend, "line"),
-            gravity[:, 1:2] - of(bend, "roll"),
+            gravity[:, 0:1] + line,
+            gravity[:, 1:2] - roll,
             gravity[:, 0:1],
             -gravity[:, 1:2],
-            leg * (gyro[:, 1:2] + of(joint_vel, "line")),
-            -leg * (gyro[:, 0:1] + of(joint_vel, "roll")),
+            leg * (gyro[:, 1:2] + line_rate),
+            -leg * (gyro[:, 0:1] + roll_rate),
         )
 
     def capture(self, lean: Lean) -> Tensor:
@@ -157,21 +163,28 @@ class Gait(nn.Module):
         error, error_left = lean.forward_speed - command[:, 0:1], lean.left_speed - command[:, 1:2]
         further = torch.clamp(s.placement * error / (s.pendulum * s.leg), -s.reach, s.reach) * walking
         further_left = torch.clamp(s.placement_aside * error_left / (s.pendulum * s.leg), -s.reach, s.reach) * walking
-        total = (s.sway * walking * sin) * (self.left_aside + self.right_aside)
-        total = total + s.load * walking * ((1 - sin) / 2 * self.loads[0] + (1 + sin) / 2 * self.loads[1])
-        for sign, lifted, placed, side in (
-            (-1.0, torch.relu(sin) ** 2, (1 - cos) / 2, "left"),
-            (1.0, torch.relu(-sin) ** 2, (1 + cos) / 2, "right"),
-        ):
-            part = lambda what, side=side: getattr(self, f"{side}_{what}")  # noqa: E731
-            total = total + s.lift * lifted * part("raise")
-            total = total + (sign * cos * swept[:, 0:1] / s.leg + placed * further) * part("forward")
-            total = total + (sign * cos * swept[:, 1:2] / s.leg + placed * further_left) * part("aside")
-            total = total + (sign * cos * swept[:, 2:3]) * part("turn")
-            # A standing leg turns the trunk back; the other is put where it would be under a level trunk.
-            turned = torch.where(lifted > 0, -1.0, s.upright) * walking
-            total = total + turned * lean.pitch * part("pitch") + turned * lean.roll * part("roll")
-        return total
+        lifted = torch.relu(-self.sides * sin)  # (N, 2), left and right, as all of these
+        back = self.sides * cos
+        placed = (1 + back) / 2
+        # A standing leg turns the trunk back; the other is put where it would be under a level trunk.
+        turned = torch.where(lifted > 0, -1.0, s.upright) * walking
+        shares = [
+            s.lift * lifted**2,
+            back * (swept[:, 0:1] / s.leg) + placed * further,
+            back * (swept[:, 1:2] / s.leg) + placed * further_left,
+            back * swept[:, 2:3],
+            turned * lean.pitch,
+            turned * lean.roll,
+            s.sway * walking * sin,
+            s.load * walking * (1 + self.sides * sin) / 2,
+        ]
+        return torch.cat(shares, dim=-1) @ self.basis
+
+
+def _row(joint_names: Sequence[str], prefix: str, parts: dict[str, float]) -> list[float]:
+    """A share for each joint: those of ``parts`` in the leg whose joints begin with ``prefix``."""
+    shares = {f"{prefix}{part}_joint": share for part, share in parts.items()}
+    return [shares.get(name, 0.0) for name in joint_names]
 
 
 def single_loads(model: mujoco.MjModel, pose: np.ndarray, kp: np.ndarray) -> np.ndarray:

@@ -185,13 +185,29 @@ class PolicyGraph(nn.Module):
         them give ``skill_value``: the critic's value over that of an undisturbed episode, so 1 is healthy.
         """
         every = torch.eye(len(self.labels))
-        rows = lambda x: x.expand(len(self.labels), -1)  # noqa: E731
-        measured = joint_pos, joint_vel, orientation_base_in_world, angular_velocity_base_in_base, command_velocity
-        carried = carry_phase, carry_skill, carry_posture, carry_command, carry_gait, carry_capture, carry_action
-        might = self.advance(*map(rows, measured), every, *map(rows, carried))
+        given = {
+            "joint_pos": joint_pos,
+            "joint_vel": joint_vel,
+            "orientation_base_in_world": orientation_base_in_world,
+            "angular_velocity_base_in_base": angular_velocity_base_in_base,
+            "command_velocity": command_velocity,
+            "carry_phase": carry_phase,
+            "carry_skill": carry_skill,
+            "carry_posture": carry_posture,
+            "carry_command": carry_command,
+            "carry_gait": carry_gait,
+            "carry_capture": carry_capture,
+            "carry_action": carry_action,
+        }
+        sizes = [x.shape[-1] for x in given.values()]
+        rows = torch.cat(list(given.values()), dim=-1).expand(len(self.labels), -1).split(sizes, dim=-1)
+        might = self.advance(skill=every, **dict(zip(given, rows, strict=True)))
         observations = observe(might)
-        signals = Signals(*(x if x is self.home else skill @ x for x in might))
-        observation = skill @ observations
+        named = might._asdict()
+        named.pop("home")
+        chosen = skill @ torch.cat([*named.values(), observations], dim=-1)
+        *parts, observation = chosen.split([x.shape[-1] for x in (*named.values(), observations)], dim=-1)
+        signals = Signals(home=self.home, **dict(zip(named, parts, strict=True)))
         action = self.clip(self.actor(observation))
         value = (self.critic(observations).T / self.value_healthy).reshape(1, -1)
         return (
