@@ -92,7 +92,8 @@ class Imitator:
         self.posture = mink.PostureTask(model, 1.0)
         self.waist = np.zeros(model.nv, bool)
         self.waist[body.qvel_at] = [j.group == "waist" for j in body.robot.joints]
-        self.flat = [len(geoms) > 1 for geoms in body.hand_geoms]  # one geom alone is as round on every side
+        box = mujoco.mjtGeom.mjGEOM_BOX
+        self.flat = [bool((model.geom_type[geoms] == box).any()) for geoms in body.hand_geoms]  # others are round
         self.finger_axes = [self._finger_axis(k) for k in range(2)]
         self.tasks = [
             *(self.base, self.trunk, self.balance, self.posture),
@@ -102,7 +103,7 @@ class Imitator:
     def _arms_and_the_rest(self) -> list[tuple[list[int], list[int]]]:
         """Pairs to keep apart: what moves with an elbow, and every other colliding geom of the robot."""
         model = self.model
-        solid = np.flatnonzero((model.geom_contype | model.geom_conaffinity) & (model.geom_bodyid != 0))
+        solid = np.flatnonzero(((model.geom_contype | model.geom_conaffinity) != 0) & (model.geom_bodyid != 0))
         elbows = [model.jnt_bodyid[self.body.joint_ids[f"{side}_elbow"]] for side in SIDES]
         arms = [[g for g in solid.tolist() if _carries(model, elbow, model.geom_bodyid[g])] for elbow in elbows]
         shoulders = [model.jnt_bodyid[self.model.joint(self.body.limbs[f"{s}_shoulder"][0]).id] for s in SIDES]
