@@ -85,8 +85,7 @@ def main(argv: list[str]) -> int:
     from sim2real.skills import SkillPlayer
 
     player = SkillPlayer(config, policies)
-    unshown = {label for entry in config.policies.values() for label in entry.unshown}
-    operator = _operator(args, player.labels, policies, unshown)
+    operator = _operator(args, player.labels, policies, _unshown(args, config, player.labels))
     record = None if args.no_record else _record_path(args.record, config.name)
     run = _lockstep if args.clock == "lockstep" else _realtime
     with contextlib.suppress(KeyboardInterrupt):
@@ -152,6 +151,17 @@ def _policies(args: Args, config: RobotConfig, console: Console):
             f"({1 / contract.period:.0f} Hz, {len(contract.target_joint_names)} joints, sha256 {policy.sha256[:12]})"
         )
     return policies
+
+
+def _unshown(args: Args, config: RobotConfig, labels: Collection[str]) -> set[str]:
+    """What the robot's YAML keeps out of the default timeline of its own policies. Raises Sim2realError for a label that
+    none of them has."""
+    unshown = {label for entry in config.skill_set(args.skills) for label in entry.unshown} if not args.policy else set()
+    if strangers := unshown.difference(labels):
+        raise Sim2realError(
+            f"{config.path}: policies: unshown: got '{min(strangers)}', expected one of {', '.join(labels)}"
+        )
+    return unshown
 
 
 def _operator(args: Args, labels: list[str], policies, unshown: Collection[str]):

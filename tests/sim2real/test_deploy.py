@@ -8,9 +8,10 @@ import pytest
 import tiny_policy
 
 from sim2real.cli import main
-from sim2real.cli.deploy import Args, _operator
+from sim2real.cli.deploy import Args, _operator, _unshown
 from sim2real.config import CONFIG_DIR, load_robot
 from sim2real.policy import load_policy
+from sim2real.types import Sim2realError
 
 
 @pytest.fixture
@@ -128,8 +129,13 @@ def test_what_a_robot_has_unshown_is_performed_only_where_it_is_asked_for():
     entry = config.policies["ball"]
     policy = load_policy(CONFIG_DIR.parents[1] / entry.file, config, trial=0)
     labels = list(policy.contract.skill_labels)
-    assert set(entry.unshown) < set(labels)
-    shown = _operator(Args(robot="g1"), labels, [policy], entry.unshown).steps
-    assert [s.skill for s in shown] == [x for x in labels if x not in entry.unshown] + labels[:1]
-    asked = _operator(Args(robot="g1", skill=entry.unshown[0]), labels, [policy], entry.unshown).steps
+    ball = Args(robot="g1", skills="ball")
+    unshown = _unshown(ball, config, labels)
+    assert set(entry.unshown) == unshown < set(labels)
+    shown = _operator(ball, labels, [policy], unshown).steps
+    assert [s.skill for s in shown] == [x for x in labels if x not in unshown] + labels[:1]
+    asked = _operator(Args(robot="g1", skill=entry.unshown[0]), labels, [policy], unshown).steps
     assert [s.skill for s in asked] == entry.unshown
+    assert not _unshown(Args(robot="g1", policy=[policy.path]), config, labels), "a file of one's own is all shown"
+    with pytest.raises(Sim2realError, match=rf"g1.yaml: .*unshown: got '{entry.unshown[0]}', expected one of hold, carry"):
+        _unshown(ball, config, labels[:2])
