@@ -66,7 +66,7 @@ def learned(curve: Curve, targets: Mapping[str, float]) -> str:
 def _when(curve: Curve, k: int) -> str:
     samples, hours = float(curve.samples[k]), float(curve.hours[k])
     share = f"{samples / 1e6:.2g} M samples (1/{PAPER / samples:.0f} of the paper's)"
-    return share if np.isnan(hours) else f"{share}, {hours:.1f} CPU-hours"
+    return share if np.isnan(hours) else f"{share}, {hours:.2f} CPU-hours"
 
 
 def svg(curve: Curve) -> str:

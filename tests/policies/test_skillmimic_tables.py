@@ -112,7 +112,7 @@ def test_runs_one_after_another_are_one_curve(tmp_path):
     curve = read([one, two])
     assert curve.samples.tolist() == [2e6, 5e6] and curve.hours.tolist() == [1.0, 2.0]
     text = learned(curve, {"hold": 0.95, "pass": 0.85})
-    assert "| `hold` | 5 M samples (1/130 of the paper's), 2.0 CPU-hours | 96%" in text
+    assert "| `hold` | 5 M samples (1/130 of the paper's), 2.00 CPU-hours | 96%" in text
     assert "| `pass` | not yet | 20% after" in text
     drawing = ElementTree.fromstring(svg(curve))
     lines = [e for e in drawing.iter("{http://www.w3.org/2000/svg}path") if e.get("class", "").startswith("s")]
