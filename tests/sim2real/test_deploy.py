@@ -137,5 +137,7 @@ def test_what_a_robot_has_unshown_is_performed_only_where_it_is_asked_for():
     asked = _operator(Args(robot="g1", skill=entry.unshown[0]), labels, [policy], unshown).steps
     assert [s.skill for s in asked] == entry.unshown
     assert not _unshown(Args(robot="g1", policy=[policy.path]), config, labels), "a file of one's own is all shown"
-    with pytest.raises(Sim2realError, match=rf"g1.yaml: .*unshown: got '{entry.unshown[0]}', expected one of hold, carry"):
+    with pytest.raises(
+        Sim2realError, match=rf"g1.yaml: .*unshown: got '{entry.unshown[0]}', expected one of hold, carry"
+    ):
         _unshown(ball, config, labels[:2])
