@@ -84,7 +84,7 @@ class Gait(nn.Module):
         self.period = period
         n = len(joint_names)
         loads = torch.zeros(2, n) if loads is None else torch.tensor(loads).float()
-        legs = [[_row(joint_names, f"{side}_", PARTS[part]) for side in ("left", "right")] for part in PARTS]
+        legs = [[_row(joint_names, side, PARTS[part]) for side in ("left", "right")] for part in PARTS]
         of = dict(zip(PARTS, torch.tensor(legs), strict=True))  # part: (2, n), the left leg's and the right one's
         self.lines: Tensor  # (n, 4)
         self.register_buffer("lines", torch.cat([of[part] for part in MEASURED]).T.contiguous())
@@ -103,10 +103,8 @@ class Gait(nn.Module):
         base, ``bend`` (N, n) rad of the joints from the pose that is stood in."""
         left = torch.where(self.resting(phase), 0.5, (phase > 0.5).to(phase.dtype))  # what the left leg bears
         shares = torch.cat([left, 1 - left, left, 1 - left], dim=-1)
-        line, roll = torch.split((bend @ self.lines * shares).unflatten(1, (2, 2)).sum(dim=-1), 1, dim=-1)
-        line_rate, roll_rate = torch.split(
-            (joint_vel @ self.lines * shares).unflatten(1, (2, 2)).sum(dim=-1), 1, dim=-1
-        )
+        standing = lambda x: (x @ self.lines * shares).unflatten(1, (2, 2)).sum(dim=-1).split(1, dim=-1)  # noqa: E731
+        (line, roll), (line_rate, roll_rate) = standing(bend), standing(joint_vel)
         leg = self.stride.leg
         return Lean(
             gravity[:, 0:1] + line,
@@ -181,9 +179,9 @@ class Gait(nn.Module):
         return torch.cat(shares, dim=-1) @ self.basis
 
 
-def _row(joint_names: Sequence[str], prefix: str, parts: dict[str, float]) -> list[float]:
-    """A share for each joint: those of ``parts`` in the leg whose joints begin with ``prefix``."""
-    shares = {f"{prefix}{part}_joint": share for part, share in parts.items()}
+def _row(joint_names: Sequence[str], side: str, parts: dict[str, float]) -> list[float]:
+    """A share for each joint: those of ``parts`` in the leg on ``side``."""
+    shares = {f"{side}_{part}_joint": share for part, share in parts.items()}
     return [shares.get(name, 0.0) for name in joint_names]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -163,51 +163,22 @@ class PolicyGraph(nn.Module):
             "skill_value": [labels],
         }
 
-    def forward(
-        self,
-        joint_pos: Tensor,
-        joint_vel: Tensor,
-        orientation_base_in_world: Tensor,
-        angular_velocity_base_in_base: Tensor,
-        command_velocity: Tensor,
-        skill: Tensor,
-        carry_phase: Tensor,
-        carry_skill: Tensor,
-        carry_posture: Tensor,
-        carry_command: Tensor,
-        carry_gait: Tensor,
-        carry_capture: Tensor,
-        carry_action: Tensor,
-    ) -> tuple[Tensor, ...]:
-        """One tick of a batch of one. Returns the tensors of ``outputs()`` in that order.
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """One tick of a batch of one: the tensors of ``inputs()``, in that order, to those of ``outputs()``.
 
         All labels are computed at once, row k as if label k were asked for now; the asked one drives the joints, all of
         them give ``skill_value``: the critic's value over that of an undisturbed episode, so 1 is healthy.
         """
         every = torch.eye(len(self.labels))
-        given = {
-            "joint_pos": joint_pos,
-            "joint_vel": joint_vel,
-            "orientation_base_in_world": orientation_base_in_world,
-            "angular_velocity_base_in_base": angular_velocity_base_in_base,
-            "command_velocity": command_velocity,
-            "carry_phase": carry_phase,
-            "carry_skill": carry_skill,
-            "carry_posture": carry_posture,
-            "carry_command": carry_command,
-            "carry_gait": carry_gait,
-            "carry_capture": carry_capture,
-            "carry_action": carry_action,
-        }
-        sizes = [x.shape[-1] for x in given.values()]
-        rows = torch.cat(list(given.values()), dim=-1).expand(len(self.labels), -1).split(sizes, dim=-1)
-        might = self.advance(skill=every, **dict(zip(given, rows, strict=True)))
+        given = dict(zip(self.inputs(), inputs, strict=True))
+        skill = given.pop("skill")
+        might = self.advance(skill=every, **_together(given, lambda x: x.expand(len(every), -1)))
         observations = observe(might)
-        named = might._asdict()
-        named.pop("home")
-        chosen = skill @ torch.cat([*named.values(), observations], dim=-1)
-        *parts, observation = chosen.split([x.shape[-1] for x in (*named.values(), observations)], dim=-1)
-        signals = Signals(home=self.home, **dict(zip(named, parts, strict=True)))
+        each = might._asdict() | {"observation": observations}
+        del each["home"]  # which is nobody's in particular
+        chosen = _together(each, lambda x: skill @ x)
+        observation = chosen.pop("observation")
+        signals = Signals(home=self.home, **chosen)
         action = self.clip(self.actor(observation))
         value = (self.critic(observations).T / self.value_healthy).reshape(1, -1)
         return (
@@ -222,6 +193,12 @@ class PolicyGraph(nn.Module):
 def one_hot(labels: Sequence[int] | np.ndarray, size: int) -> Tensor:
     """(N,) label indices -> (N, size) float32."""
     return torch.eye(size)[torch.as_tensor(np.asarray(labels), dtype=torch.long)]
+
+
+def _together(tensors: dict[str, Tensor], change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
+    """``change`` of all ``tensors`` (N, size) side by side: one operation instead of one each."""
+    parts = change(torch.cat([*tensors.values()], dim=-1)).split([x.shape[-1] for x in tensors.values()], dim=-1)
+    return dict(zip(tensors, parts, strict=True))
 
 
 def _buffer(values: np.ndarray) -> Tensor:

@@ -11,7 +11,7 @@ from policies.ball import MASS, NAME, ball
 from policies.clips.contact import spans
 from policies.clips.format import Clip
 from policies.clips.kinematics import rate, rotate, smooth
-from policies.clips.robot import RobotBody
+from policies.clips.robot import RobotBody, solid
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 ROBOT_FRICTION = 0.6  # of a sole on the floor
@@ -50,7 +50,7 @@ def residuals(clip: Clip, body: RobotBody) -> Residuals:
     worst = {"ball": 0.0, "floor": 0.0, "self": 0.0, "sole": 0.0}
     ours = model.geom(NAME).id
     hands = [set(g.tolist()) for g in body.hand_geoms]
-    robot_geoms = np.flatnonzero((np.arange(model.ngeom) != ours) & (model.geom_bodyid != 0))
+    robot_geoms = set(solid(model, np.flatnonzero(model.geom_bodyid)).tolist()) - {ours}
     for t in range(len(clip)):
         place(model, data, clip, body, t)
         touching = set().union(*(hands[k] for k in range(2) if clip.contact[t, k]))
@@ -60,10 +60,7 @@ def residuals(clip: Clip, body: RobotBody) -> Residuals:
         if clip.header.has_ball:
             worst["ball"] = max(
                 worst["ball"],
-                *(
-                    -mujoco.mj_geomDistance(model, data, g, ours, 0.2, None)
-                    for g in _solid(model, robot_geoms) - touching
-                ),
+                *(-mujoco.mj_geomDistance(model, data, g, ours, 0.2, None) for g in robot_geoms - touching),
             )
         for k in range(2):
             if clip.contact[t, 2 + k]:
@@ -109,11 +106,6 @@ def place(model: mujoco.MjModel, data: mujoco.MjData, clip: Clip, body: RobotBod
     data.qpos[body.qpos_at] = clip.joint_pos[t]
     data.qpos[-7:-4], data.qpos[-4:] = clip.ball_position_in_world[t], (1, 0, 0, 0)
     mujoco.mj_kinematics(model, data)
-
-
-def _solid(model: mujoco.MjModel, geoms: np.ndarray) -> set[int]:
-    on = (model.geom_contype[geoms] != 0) | (model.geom_conaffinity[geoms] != 0)
-    return set(geoms[on].tolist())
 
 
 def _skate(clip: Clip) -> float:

@@ -16,7 +16,7 @@ from policies.ball import RADIUS
 from policies.clips import kinematics
 from policies.clips.format import Clip
 from policies.clips.kinematics import smooth, smooth_orientation
-from policies.clips.robot import POINT_NAMES, SIDES, RobotBody
+from policies.clips.robot import POINT_NAMES, SIDES, RobotBody, solid
 from policies.clips.targets import Targets, pulled_in, targets
 
 FPS = 50.0  # of policies
@@ -92,8 +92,8 @@ class Imitator:
         self.posture = mink.PostureTask(model, 1.0)
         self.waist = np.zeros(model.nv, bool)
         self.waist[body.qvel_at] = [j.group == "waist" for j in body.robot.joints]
-        box = mujoco.mjtGeom.mjGEOM_BOX
-        self.flat = [bool((model.geom_type[geoms] == box).any()) for geoms in body.hand_geoms]  # others are round
+        box = mujoco.mjtGeom.mjGEOM_BOX  # other hands are as round on every side
+        self.flat = [bool((model.geom_type[geoms] == box).any()) for geoms in body.hand_geoms]
         self.finger_axes = [self._finger_axis(k) for k in range(2)]
         self.tasks = [
             *(self.base, self.trunk, self.balance, self.posture),
@@ -103,11 +103,11 @@ class Imitator:
     def _arms_and_the_rest(self) -> list[tuple[list[int], list[int]]]:
         """Pairs to keep apart: what moves with an elbow, and every other colliding geom of the robot."""
         model = self.model
-        solid = np.flatnonzero(((model.geom_contype | model.geom_conaffinity) != 0) & (model.geom_bodyid != 0))
+        ours = solid(model, np.flatnonzero(model.geom_bodyid)).tolist()
         elbows = [model.jnt_bodyid[self.body.joint_ids[f"{side}_elbow"]] for side in SIDES]
-        arms = [[g for g in solid.tolist() if _carries(model, elbow, model.geom_bodyid[g])] for elbow in elbows]
+        arms = [[g for g in ours if _carries(model, elbow, model.geom_bodyid[g])] for elbow in elbows]
         shoulders = [model.jnt_bodyid[self.model.joint(self.body.limbs[f"{s}_shoulder"][0]).id] for s in SIDES]
-        rest = [g for g in solid.tolist() if not any(_carries(model, s, model.geom_bodyid[g]) for s in shoulders)]
+        rest = [g for g in ours if not any(_carries(model, s, model.geom_bodyid[g]) for s in shoulders)]
         return [(arms[0], rest), (arms[1], rest), (arms[0], arms[1])]
 
     def _finger_axis(self, k: int) -> np.ndarray:

@@ -118,8 +118,7 @@ class RobotBody:
         return float(np.mean(heights))
 
     def _solid(self, body: int) -> np.ndarray:
-        geoms = np.flatnonzero(self.model.geom_bodyid == body)
-        return geoms[(self.model.geom_contype[geoms] != 0) | (self.model.geom_conaffinity[geoms] != 0)]
+        return solid(self.model, np.flatnonzero(self.model.geom_bodyid == body))
 
     def points(self, data: mujoco.MjData) -> np.ndarray:
         """(14, 3) m in the world, in the order of ``POINT_NAMES``, of a configuration whose kinematics are up to date."""
@@ -155,3 +154,8 @@ class RobotBody:
     def length(self, a: str, b: str) -> float:
         """Distance of two key points of a side at rest, m: ``length("shoulder", "elbow")``."""
         return float(np.mean([np.linalg.norm(self.rest[f"{s}_{a}"] - self.rest[f"{s}_{b}"]) for s in SIDES]))
+
+
+def solid(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:
+    """Those of ``geoms`` (k,), by id, that can touch something."""
+    return geoms[(model.geom_contype[geoms] != 0) | (model.geom_conaffinity[geoms] != 0)]

@@ -156,9 +156,8 @@ def _policies(args: Args, config: RobotConfig, console: Console):
 def _unshown(args: Args, config: RobotConfig, labels: Collection[str]) -> set[str]:
     """What the robot's YAML keeps out of the default timeline of its own policies. Raises Sim2realError for a label that
     none of them has."""
-    unshown = (
-        {label for entry in config.skill_set(args.skills) for label in entry.unshown} if not args.policy else set()
-    )
+    own = [] if args.policy else config.skill_set(args.skills)
+    unshown = {label for entry in own for label in entry.unshown}
     if strangers := unshown.difference(labels):
         raise Sim2realError(
             f"{config.path}: policies: unshown: got '{min(strangers)}', expected one of {', '.join(labels)}"
