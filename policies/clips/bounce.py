@@ -1,16 +1,22 @@
-"""A dribble by formula: no recording shows a ball bounced in place, so this one is physics.
+"""Bounces by formula: no recording shows a ball bounced in place, so these are physics.
 
-A stroke begins where the ball stands still, at its peak: a palm on top of it pushes it down with one constant
+A dribble's stroke begins where the ball stands still, at its peak: a palm on top of it pushes it down with one constant
 acceleration, leaves it, comes to rest, and is back when the ball is, which has bounced with its restitution. So the
-stroke repeats exactly, and palm and ball meet with no speed between them. The arm follows by inverse kinematics, which
-keeps the palm down, but minds where the hand is ten times as much: to keep it level to the last degree would swing a heavy
-shoulder, and that shakes the robot off its feet. On its way back the palm follows a cubic. Liu & Hodgins (2018), too, needed no recorded ball.
+stroke repeats exactly, and palm and ball meet with no speed between them.
+
+Both hands let a ball drop that they hold between them, close on it where it comes to rest, and lift it to where it was.
+Whatever they and the floor did to it on its way, they put right while they hold it.
+
+The arms follow by inverse kinematics, which keeps the palms facing as they should, but minds where the hands are much
+more: to keep a palm level to the last degree would swing a heavy shoulder, and that shakes the robot off its feet. Liu &
+Hodgins (2018), too, needed no recorded ball.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, Self
 
 import mink
 import mujoco
@@ -26,92 +32,195 @@ GRAVITY = 9.81  # m/s^2
 SOLVER = "daqp"
 CLEAR = 0.015  # m between palm and ball while they do not touch
 SMOOTHING = 0.5  # frames
-TURNED = 0.1  # m/rad: what a turned hand counts beside one that is elsewhere
-TICK = 0.02  # s of a policy: a stroke lasts some of them
-SETTLING = 3  # strokes before the one that is kept: then inverse kinematics has forgotten where it began
+TICK = 0.02  # s of a policy: a bounce lasts some of them
+SETTLING = 3  # bounces before the one that is kept: then inverse kinematics has forgotten where it began
+KNEES = 0.35  # rad, bent: as the robot stands at home
 
 
-@dataclass(frozen=True)
-class Stroke:
-    """One bounce, at the size of the robot."""
+class Path(NamedTuple):
+    """A bounce over time, (T,) each."""
 
-    peak: float = 1.0  # m, the ball's centre where the palm finds it
-    push: float = 0.2  # m that the palm stays on it
-    follow: float = 0.3  # m in which the palm then comes to rest
-    place: tuple[float, float] = (0.3, 0.27)  # m from the base: ahead, and to the side of the arm
-    knees: float = 0.35  # rad, bent: as the robot stands at home
+    ball: np.ndarray  # m, height of its centre
+    velocity: np.ndarray  # m/s upwards
+    palm: np.ndarray  # m, height of a ball that the palms would lie on
+    apart: np.ndarray  # m between each palm and that ball
+    on: np.ndarray  # bool: palms and ball touch
 
 
-class Times(NamedTuple):
-    """Of a stroke: seconds, and m/s."""
+class Bounce(Protocol):
+    """One way to bounce a ball of ``radius`` m, at the size of the robot."""
 
+    def period(self, radius: float) -> float:
+        """s until it repeats."""
+        ...
+
+    def lasting(self, radius: float, period: float) -> Self:
+        """The same, changed so that it lasts ``period`` s."""
+        ...
+
+    def path(self, radius: float, t: np.ndarray) -> Path:
+        """At times ``t`` (T,) s since the ball was last at rest in the hands."""
+        ...
+
+
+class Flight(NamedTuple):
+    """A ball that is pushed down from rest at ``top``, let go at ``leave``, and bounces to ``peak``: heights of its centre,
+    m; durations, s; and m/s downwards where the palms leave it."""
+
+    top: float
+    leave: float
+    peak: float
     push: float
-    fall: float  # from the palm to the floor
+    fall: float  # from the palms to the floor
     rise: float  # from the floor to the peak
-    release: float  # speed downwards where the palm leaves the ball
+    release: float
+
+    @classmethod
+    def of(cls, top: float, leave: float, peak: float, radius: float) -> Flight:
+        """What follows from the restitution: the ball's speeds are those that bring it to its peak."""
+        off = np.sqrt(2 * GRAVITY * (peak - radius))
+        hit = off / ball.RESTITUTION
+        release = np.sqrt(hit**2 - 2 * GRAVITY * (leave - radius))
+        return cls(top, leave, peak, 2 * (top - leave) / release, (hit - release) / GRAVITY, off / GRAVITY, release)
 
     @property
     def period(self) -> float:
         return self.push + self.fall + self.rise
 
+    def at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Height (T,) m and velocity upwards (T,) m/s at times ``t`` (T,) s in [0, period]."""
+        pull, f, left = self.release / self.push, t - self.push, self.period - t
+        phase = [t < self.push, f < self.fall]
+        z = [self.top - pull * t**2 / 2, self.leave - self.release * f - GRAVITY * f**2 / 2]
+        v = [-pull * t, -self.release - GRAVITY * f]
+        return np.select(phase, z, self.peak - GRAVITY * left**2 / 2), np.select(phase, v, GRAVITY * left)
 
-def times(stroke: Stroke, radius: float) -> Times:
-    """What follows from the restitution: ball speeds are those that bring it back to its peak."""
-    off = np.sqrt(2 * GRAVITY * (stroke.peak - radius))
-    hit = off / ball.RESTITUTION
-    release = np.sqrt(hit**2 - 2 * GRAVITY * (stroke.peak - stroke.push - radius))
-    return Times(2 * stroke.push / release, (hit - release) / GRAVITY, off / GRAVITY, release)
-
-
-def lasting(stroke: Stroke, radius: float, period: float) -> Stroke:
-    """The stroke with its peak moved so that it lasts ``period`` s."""
-    low, high = stroke.peak - 0.1, stroke.peak + 0.1
-    for _ in range(50):
-        stroke = replace(stroke, peak=(low + high) / 2)
-        low, high = (stroke.peak, high) if times(stroke, radius).period < period else (low, stroke.peak)
-    return stroke
-
-
-def path(stroke: Stroke, radius: float, t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """At times ``t`` (T,) s since a peak, (T,) each: the ball's height m and velocity m/s, the height m of a ball that the
-    palm would lie on, and whether it does."""
-    k = times(stroke, radius)
-    s = np.mod(t, k.period)
-    pull = k.release / k.push
-    on, falls = s < k.push, s < k.push + k.fall
-    f, left = s - k.push, k.period - s  # since the palm left, and until the next peak
-    leave = stroke.peak - stroke.push
-    z = np.select([on, falls], [stroke.peak - pull * s**2 / 2, leave - k.release * f - GRAVITY * f**2 / 2],
-                  stroke.peak - GRAVITY * left**2 / 2)  # fmt: skip
-    v = np.select([on, falls], [-pull * s, -k.release - GRAVITY * f], GRAVITY * left)
-    stop = 2 * stroke.follow / k.release  # s in which the palm comes to rest
-    low = leave - stroke.follow
-    u = np.clip((f - stop) / (k.fall + k.rise - stop), 0, 1)  # and back, from rest to rest
-    back = np.where(
-        f < stop,
-        leave - k.release * f + k.release**2 / (4 * stroke.follow) * f**2,
-        low + (stroke.peak - low) * (3 * u**2 - 2 * u**3),
-    )
-    above = np.maximum.reduce([back, z + np.minimum(CLEAR, GRAVITY * left**2 / 4)])
-    return z, v, np.where(on, z, above), on
+    def palms(self, t: np.ndarray, over: float, early: float, eased: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Height (T,) m of palms that leave the ball, come to rest ``over`` m below, and then go to its peak, where they are
+        ``early`` s before it; ``eased`` maps their way there, from 0 to 1."""
+        f, stop, low = t - self.push, 2 * over / self.release, self.leave - over
+        u = np.clip((f - stop) / (self.fall + self.rise - early - stop), 0, 1)
+        brakes = self.leave - self.release * f + self.release**2 / (4 * over) * f**2
+        return np.where(f < stop, brakes, low + (self.peak - low) * eased(u))
 
 
-def dribble(body: RobotBody, name: str, stroke: Stroke = Stroke(), side: str = "right", fps: float = 100.0) -> Clip:
-    """One stroke of ``side``'s hand, from peak to peak, by a robot that stands with bent knees."""
-    sign = 1.0 if side == "left" else -1.0
-    frames = round(round(times(stroke, ball.RADIUS).period / TICK) * TICK * fps)
-    stroke = lasting(stroke, ball.RADIUS, frames / fps)
-    period = frames / fps
-    t = np.arange(frames * (SETTLING + 2)) * period / frames
-    z, v, palm, on = path(stroke, ball.RADIUS, t)
-    names = body.robot.joint_names
+@dataclass(frozen=True)
+class Stroke:
+    """A dribble's: a palm from above."""
+
+    peak: float = 1.0  # m, the ball's centre where the palm finds it
+    push: float = 0.2  # m that the palm stays on it
+    follow: float = 0.3  # m in which the palm then comes to rest
+    place: tuple[float, float] = (0.3, 0.27)  # m from the base: ahead, and to the side of the arm
+
+    def flight(self, radius: float) -> Flight:
+        return Flight.of(self.peak, self.peak - self.push, self.peak, radius)
+
+    def period(self, radius: float) -> float:
+        return self.flight(radius).period
+
+    def lasting(self, radius: float, period: float) -> Stroke:
+        """With its peak moved."""
+        stroke, low, high = self, self.peak - 0.1, self.peak + 0.1
+        for _ in range(50):
+            stroke = replace(stroke, peak=(low + high) / 2)
+            low, high = (stroke.peak, high) if stroke.period(radius) < period else (low, stroke.peak)
+        return stroke
+
+    def path(self, radius: float, t: np.ndarray) -> Path:
+        """The palm is never in the ball."""
+        flight = self.flight(radius)
+        t = np.mod(t, flight.period)
+        z, v = flight.at(t)
+        back = flight.palms(t, self.follow, 0.0, lambda u: 3 * u**2 - 2 * u**3)
+        above = np.maximum(back, z + np.minimum(CLEAR, GRAVITY * (flight.period - t) ** 2 / 4))
+        on = t < flight.push
+        return Path(z, v, np.where(on, z, above), np.zeros(len(t)), on)
+
+
+@dataclass(frozen=True)
+class Drop:
+    """Both palms from the sides. Nothing is pushed and nothing moves fast: a robot that has to step loses the ball."""
+
+    top: float = 1.06  # m, the ball's centre where it is held
+    along: float = 0.01  # m that the palms fall with it
+    follow: float = 0.03  # m in which they then come to rest
+    ahead: float = 0.22  # m from the base
+    open: float = 0.08  # m between each palm and a ball that is away
+    opening: float = 0.14  # s
+    closing: float = 0.12  # s
+    lift: float = 0.8  # s from where it is caught to where it is held
+    rest: float = 0.2  # s there
+    fingers: float = 0.2  # rad that they point down
+
+    def flight(self, radius: float) -> Flight:
+        peak = radius + ball.RESTITUTION**2 * (self.top - radius)
+        return Flight.of(self.top, self.top - self.along, peak, radius)
+
+    def period(self, radius: float) -> float:
+        return self.flight(radius).period + self.lift + self.rest
+
+    def lasting(self, radius: float, period: float) -> Drop:
+        """With another rest."""
+        return replace(self, rest=self.rest + period - self.period(radius))
+
+    def path(self, radius: float, t: np.ndarray) -> Path:
+        flight = self.flight(radius)
+        t = np.mod(t, self.period(radius))
+        f, left = t - flight.push, flight.period - t  # since the palms let go, and until they are back
+        away, u, lift = (f > 0) & (left > 0), np.clip(-left / self.lift, 0, 1), flight.top - flight.peak
+        z, v = flight.at(np.minimum(t, flight.period))
+        z, v = z + lift * _eased(u), v + lift / self.lift * 30 * u**2 * (1 - u) ** 2
+        palm = flight.palms(t, self.follow, self.closing, _eased)
+        apart = self.open * _eased(f / self.opening) * _eased(left / self.closing)
+        return Path(z, v, np.where(away, palm, z), np.where(away, apart, 0.0), ~away)
+
+
+def _eased(u: np.ndarray) -> np.ndarray:
+    """From 0 to 1 with the least jerk (T. Flash and N. Hogan, J. Neuroscience 5, 1985)."""
+    u = np.clip(u, 0, 1)
+    return u**3 * (10 - 15 * u + 6 * u**2)
+
+
+def dribble(body: RobotBody, name: str, side: str, stroke: Stroke = Stroke()) -> Clip:
+    """One stroke of ``side``'s hand, from peak to peak, its palm looking down."""
+    ahead, aside = stroke.place
+    place = (ahead, aside if side == "left" else -aside)
+    return _clip(body, name, stroke, place, {side: mink.SO3.from_x_radians(np.pi)}, 0.1, f"{side} hand")
+
+
+def bounce(body: RobotBody, name: str, drop: Drop = Drop()) -> Clip:
+    """One bounce with both hands, from rest to rest, palms looking at each other."""
+    down, towards = mink.SO3.from_y_radians(drop.fingers), {"left": np.pi / 2, "right": -np.pi / 2}
+    facing = {side: down @ mink.SO3.from_x_radians(angle) for side, angle in towards.items()}
+    return _clip(body, name, drop, (drop.ahead, 0.0), facing, 0.03, "both hands")
+
+
+def _clip(
+    body: RobotBody,
+    name: str,
+    motion: Bounce,
+    place: tuple[float, float],
+    facing: Mapping[str, mink.SO3],
+    turned: float,
+    source: str,
+    fps: float = 100.0,
+) -> Clip:
+    """``motion`` by a robot that stands with bent knees, with the ball ``place`` (m ahead, m left) of its base.
+
+    ``facing``: how the palm of each hand at work is turned: a palm looks along its z axis, fingers along x;
+    ``turned`` m/rad: what a hand turned otherwise counts beside one that is elsewhere.
+    """
+    radius = ball.RADIUS
+    frames = round(round(motion.period(radius) / TICK) * TICK * fps)
+    motion = motion.lasting(radius, frames / fps)
+    path = motion.path(radius, np.arange(frames * (SETTLING + 2)) / fps)
+    names, model = body.robot.joint_names, body.model
     pose = body.robot.home_pos.copy()
-    for joint, angle in (("hip_pitch", -stroke.knees / 2), ("knee", stroke.knees), ("ankle_pitch", -stroke.knees / 2)):
+    for joint, angle in (("hip_pitch", -KNEES / 2), ("knee", KNEES), ("ankle_pitch", -KNEES / 2)):
         pose[[names.index(f"{s}_{joint}_joint") for s in SIDES]] = angle
-    height = float(standing_height(body.model, pose[None])[0])
-    model = body.model
-    touch = body.palm_height(ball.RADIUS)
-    place = np.array([stroke.place[0], sign * stroke.place[1]])
+    height = float(standing_height(model, pose[None])[0])
+    touch = body.palm_height(radius)
 
     data = mujoco.MjData(model)
     configuration = mink.Configuration(model)
@@ -119,21 +228,22 @@ def dribble(body: RobotBody, name: str, stroke: Stroke = Stroke(), side: str = "
     q[:3], q[3:7] = [0, 0, height], [1, 0, 0, 0]
     q[body.qpos_at] = pose
     configuration.update(q)
-    mine = np.array([j.group == "arm" and side in j.name for j in body.robot.joints])
+    mine = np.array([j.group == "arm" and any(s in j.name for s in facing) for j in body.robot.joints])
     still = np.ones(model.nv, bool)
     still[body.qvel_at[mine]] = False
-    reach = mink.FrameTask(f"{side}_palm", "site", 1.0, TURNED)
+    reach = [mink.FrameTask(f"{s}_palm", "site", 1.0, turned) for s in facing]
     posture = mink.PostureTask(model, 3e-2)
     posture.set_target(q)
     freeze = mink.DofFreezingTask(model, np.flatnonzero(still).tolist())
     limits = [mink.ConfigurationLimit(model)]
-    down = mink.SO3.from_x_radians(np.pi)
     rows = []
-    for k in range(len(t)):
-        reach.set_target(mink.SE3.from_rotation_and_translation(down, np.array([*place, palm[k] + touch])))
+    for palm, apart in zip(path.palm, path.apart, strict=True):
+        for task, turn in zip(reach, facing.values(), strict=True):
+            there = np.array([*place, palm]) - turn.apply(np.array([0.0, 0.0, touch + apart]))
+            task.set_target(mink.SE3.from_rotation_and_translation(turn, there))
         for _ in range(12):
             speed = mink.solve_ik(
-                configuration, [reach, posture], 0.1, SOLVER, damping=1e-3, limits=limits, constraints=[freeze]
+                configuration, [*reach, posture], 0.1, SOLVER, damping=1e-3, limits=limits, constraints=[freeze]
             )
             configuration.integrate_inplace(speed, 0.1)
         rows.append(configuration.q[body.qpos_at].copy())
@@ -144,11 +254,10 @@ def dribble(body: RobotBody, name: str, stroke: Stroke = Stroke(), side: str = "
         data.qpos[:3], data.qpos[3:7], data.qpos[body.qpos_at] = [0, 0, height], [1, 0, 0, 0], joints
         mujoco.mj_kinematics(model, data)
         points[k] = body.points(data)
-    hands = np.array([[on_now and s == side for s in SIDES] for on_now in on[last]])
+    hands = path.on[last, None] & np.array([s in facing for s in SIDES])
     header = Header(
-        name=name, skill=name.rsplit("_", 1)[0], body=body.robot.name, fps=fps,
-        joint_names=names, point_names=POINT_NAMES, ball_radius=ball.RADIUS, source=f"policies/clips/bounce.py, {side} hand",
-        licence="Apache-2.0",
+        name=name, skill=name.rsplit("_", 1)[0], body=body.robot.name, fps=fps, joint_names=names,
+        point_names=POINT_NAMES, ball_radius=radius, source=f"policies/clips/bounce.py, {source}", licence="Apache-2.0",
     )  # fmt: skip
     return Clip(
         header,
@@ -156,7 +265,7 @@ def dribble(body: RobotBody, name: str, stroke: Stroke = Stroke(), side: str = "
         base_orientation_in_world=np.tile([1.0, 0, 0, 0], (frames, 1)),
         joint_pos=joint_pos,
         points_in_world=points,
-        ball_position_in_world=np.column_stack([np.tile(place, (frames, 1)), z[last]]),
-        ball_velocity_in_world=np.column_stack([np.zeros((frames, 2)), v[last]]),
+        ball_position_in_world=np.column_stack([np.tile(place, (frames, 1)), path.ball[last]]),
+        ball_velocity_in_world=np.column_stack([np.zeros((frames, 2)), path.velocity[last]]),
         contact=np.column_stack([hands, np.ones((frames, 2), bool)]),
     )

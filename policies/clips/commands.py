@@ -149,11 +149,12 @@ def _to_retarget(
 
 def _bounces(body: RobotBody) -> Iterator[Clip]:
     """What the library of a robot has made by formula."""
-    from policies.clips.bounce import dribble
+    from policies.clips.bounce import bounce, dribble
 
-    for skill, sides in library.robot_library(body.robot).bounces.items():
-        for number, side in enumerate(sides, 1):
-            yield dribble(body, f"{skill}_{number:02d}", side=side)
+    for skill, hands in library.robot_library(body.robot).bounces.items():
+        for number, hand in enumerate(hands, 1):
+            name = f"{skill}_{number:02d}"
+            yield bounce(body, name) if hand == "both" else dribble(body, name, hand)
 
 
 def _library_folder(robot: str) -> Path:

@@ -34,7 +34,7 @@ class Library(Strict):
     """Every piece that a robot's skills are trained on."""
 
     skills: dict[str, list[Piece]]
-    bounces: dict[str, list[Literal["left", "right"]]] = {}  # made by formula (bounce.py), by this hand
+    bounces: dict[str, list[Literal["left", "right", "both"]]] = {}  # made by formula (bounce.py), by these hands
 
 
 def library_path(robot: str) -> Path:

@@ -26,7 +26,7 @@ from sim2real.policy import load_policy
 
 SECONDS = 10.0  # of an episode; that of a skill that ends by itself ends with its clip
 TARGETS = {"hold": 0.95, "raise": 0.95, "carry": 0.95, "pass": 0.85, "shot": 0.85, "pickup": 0.70, "catch": 0.70,
-           "dribble_in_place": 0.60}  # fmt: skip
+           "dribble_in_place": 0.60, "bounce": 0.60}  # fmt: skip
 CELL = 25  # episodes of a cell of the tables, at most
 GAP = 0.05  # of success, the most that may be lost from training's world to the bytes with a camera
 WAYS = ("training", "truth", "camera")

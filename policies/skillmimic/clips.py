@@ -22,6 +22,7 @@ from policies.skillmimic.stance import crouched, stand, trunk
 
 SINGULAR = 0.08  # m/rad: damps the way back from palms to joints where an arm is stretched
 LATE = 0.02  # s, on average, until a target acts: it is held for a tick, and travels
+YIELD = 0.24  # s after both palms have met a ball that bounces, until which they have brought it where it belongs
 LEVER = 0.3  # m: of palms, a rad counts as this far
 PRESS = 0.004  # m the palms start inside the ball, so that they carry it from the first step on
 
@@ -165,6 +166,9 @@ class ReferenceClips:
                 back[t, :, : TIPS.start] += _inverse(moves)
                 tips = LEVER * np.array([turns[1], -turns[0]])
                 back[t, :, TIPS] += _inverse(np.concatenate([moves, tips]))[:, TIPS] * LEVER
+        if self.loop[clip] and self.hands[clip].all():
+            share = _followed(m.contact[at, 0] > 0, velocity[:, 2] > 0, YIELD / self._config.period)
+            back *= share[:, None, None]
         return Rows(target, ball_in_base, velocity, back, bool(self.loop[clip]), pulls)
 
     def _gone(self, clip: int, at: np.ndarray) -> np.ndarray:
@@ -229,6 +233,17 @@ def grip(clip: Clip, model: mujoco.MjModel, body: RobotBody, kp: np.ndarray, for
         legs = np.array([j.group == "leg" for j in body.robot.joints])
         effort[t] = np.where(legs & (not standing), 0.0, torque / kp)
     return Grip(press, effort)
+
+
+def _followed(held: np.ndarray, rises: np.ndarray, rows: float) -> np.ndarray:
+    """(T,) in [0, 1]: how far two palms follow a ball that is off its place, in a clip that begins again. ``held``, ``rises``
+    (T,) bool. Not while it falls, which only shakes the robot; more and more in the first half of its rise; and less and
+    less in the first ``rows`` in which they hold it: a ball between palms that follow it runs away with them."""
+    free = rises & ~held
+    risen = np.where(free, np.cumsum(free) / max(1.0, free.sum() / 2), 0.0)
+    twice = np.tile(held, 2)
+    since = np.arange(len(twice)) - np.maximum.accumulate(np.where(twice, 0, np.arange(len(twice))))
+    return np.clip(np.where(held, 1 - since[len(held) :] / rows, risen), 0, 1)
 
 
 def _jacobian(model: mujoco.MjModel, data: mujoco.MjData, point: np.ndarray, link: int) -> np.ndarray:

@@ -17,7 +17,7 @@ class SkillMimic:
     skills: tuple[str, ...] = ("hold",)
     clips: tuple[str, ...] = ("hold_05",)  # only these of them, by name; none: all
     swing: tuple[str, ...] = ("hold", "carry")  # skills whose clips play to and fro; others end
-    loop: tuple[str, ...] = ("dribble_in_place",)  # skills whose clips begin again where they end
+    loop: tuple[str, ...] = ("dribble_in_place", "bounce")  # skills whose clips begin again where they end
     after: float = 1.0  # s that an episode goes on beyond the end of a clip, at its last frame
     practise: tuple[str, ...] = ()  # only these of the skills, for now; none: all
     anywhere: bool = True  # episodes start anywhere in a clip, not only at its beginning
@@ -28,7 +28,7 @@ class SkillMimic:
     base: str | None = None
     corrections: str | None = None  # of the plan of the arms (plan.py), a file; only with a base
     # skills in which the ball, and not the clock, says how far on
-    timed: tuple[str, ...] = ("catch", "dribble_in_place")
+    timed: tuple[str, ...] = ("catch", "dribble_in_place", "bounce")
     walks: tuple[str, ...] = ()  # skills during which the base obeys velocity commands
     still: float = 0.3  # share of their episodes without any
     # the policy
@@ -87,6 +87,7 @@ BALL = {  # a clip each: the calmest, and those that come from and go to the fro
     "pass": "pass_02",
     "catch": "catch_06",
     "dribble_in_place": "dribble_in_place_01",
+    "bounce": "bounce_01",
 }
 TASKS: dict[str, SkillMimic] = {
     "g1-ball": SkillMimic(base=BASE, corrections="policies/g1/plan.yaml", skills=tuple(BALL), clips=tuple(BALL.values()),

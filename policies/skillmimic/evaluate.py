@@ -53,7 +53,10 @@ class Trace(NamedTuple):
 LENGTH = 0.745  # of the G1, over a person's: distances of the paper's rules times this
 ASIDE, LEAST = np.deg2rad(20.0), 1.5  # rad off the commanded direction, and m/s forwards, of a ball that was thrown
 HELD = 0.5  # s at the end of an episode during which a caught ball is held
-LIVELY = 2.0  # s after its last touch for which a ball is being dribbled
+LIVELY = (
+    2.0  # s after its last touch for which a ball is being dribbled, and after its last bounce for which it is bounced
+)
+BOUNCED = 1.0  # m/s upwards of a ball that nobody touches: it comes from the floor
 
 
 def _kept(t: Trace, period: float, ticks: int) -> float:
@@ -79,9 +82,20 @@ def _caught(t: Trace, period: float, ticks: int) -> float:
 def _dribbled(t: Trace, period: float, ticks: int) -> float:
     """Section 6.2: the share of frames with base above 0.5 m and ball nearer than 1.5 m, at the robot's size; frames after
     a failure do not count, nor those more than 2 s after the last touch."""
-    frames = np.arange(len(t.held))
-    touched = np.maximum.accumulate(np.where(t.held, frames, 0))
-    lively = (frames - touched) * period < LIVELY
+    return _lively(t, t.held, period, ticks)
+
+
+def _bounced(t: Trace, period: float, ticks: int) -> float:
+    """As a dribble, and frames more than 2 s after the ball last came up from the floor do not count: who only holds it
+    does not bounce it."""
+    return _lively(t, ~t.held & (t.ball_velocity[:, 2] > BOUNCED), period, ticks)
+
+
+def _lively(t: Trace, event: np.ndarray, period: float, ticks: int) -> float:
+    """The share of good frames that are less than ``LIVELY`` s after an ``event`` (T,) bool, or after the beginning."""
+    frames = np.arange(len(event))
+    last = np.maximum.accumulate(np.where(event, frames, 0))
+    lively = (frames - last) * period < LIVELY
     return float((t.up & lively & (t.height > 0.5 * LENGTH) & (t.apart < 1.5 * LENGTH)).sum() / ticks)
 
 
@@ -91,6 +105,7 @@ RULES: dict[str, Callable[[Trace, float, int], float]] = {
     "catch": _caught,
     "dribble_in_place": _dribbled,
     "dribble_forward": _dribbled,
+    "bounce": _bounced,
 }
 """Success in [0, 1] of an episode of ``ticks``, had nothing failed, by skill; of every other skill: ``_kept``."""
 

@@ -53,13 +53,15 @@ def sweeps(graph: PolicyGraph, episodes: int, seconds: float, act: Act, tell: Te
 
 
 def pairs(graph: PolicyGraph) -> list[tuple[str, str]]:
-    """Every two skills of which the first ends, and the second begins, with the ball in both hands."""
+    """Every two skills of which the first ends, and the second begins, with the ball in both hands; one that bounces it
+    does not end."""
     begins, ends = [], []
     for label in graph.labels:
         clips = [c for c in robot_clips(graph.config.robot, label) if c.name in graph.clips.names]
         starts = all(c.contact[0, :2].all() for c in clips)
         begins += [label] * starts
-        ends += [label] * (starts if label in graph.config.swing else all(c.contact[-1, :2].all() for c in clips))
+        if label not in graph.config.loop:
+            ends += [label] * (starts if label in graph.config.swing else all(c.contact[-1, :2].all() for c in clips))
     return [(a, b) for a in ends for b in begins if a != b]
 
 

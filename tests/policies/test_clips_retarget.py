@@ -236,7 +236,7 @@ def test_shipped_points_are_where_the_joints_put_them():
 
 
 @pytest.mark.parametrize(
-    "skill", ["hold", "carry", "raise", "pass", "shot", "catch", "pickup", "dribble_in_place", "walk"]
+    "skill", ["hold", "carry", "raise", "pass", "shot", "catch", "pickup", "dribble_in_place", "bounce", "walk"]
 )
 def test_a_skill_has_clips(skill):
     clips = library.robot_clips("g1", skill)

@@ -9,7 +9,10 @@ import pytest
 
 from policies.evaluate import Rate
 from policies.skillmimic import mixture
+from policies.skillmimic.config import TASKS
 from policies.skillmimic.evaluate import Result
+
+SKILLS = len(TASKS["g1-ball"].skills)
 
 
 def result(survived: int) -> Result:
@@ -40,11 +43,11 @@ def test_every_skill_sees_as_many_samples_alone_as_mixed(tmp_path, monkeypatch, 
     monkeypatch.setattr(sys, "argv", words)
     mixture.main()
     out = capsys.readouterr().out
-    assert out.count(", alone, seed 1:") == out.count(", all in one policy, seed 1:") == 5
+    assert out.count(", alone, seed 1:") == out.count(", all in one policy, seed 1:") == SKILLS
     assert "| `catch` |" in (tmp_path / "m.md").read_text()
     configs = {p.parent.name: json.loads(p.read_text())["config"] for p in tmp_path.glob("*/config.json")}
-    assert configs["g1-ball-all-1"]["samples"] == 5 * configs["g1-ball-hold-1"]["samples"]
+    assert configs["g1-ball-all-1"]["samples"] == SKILLS * configs["g1-ball-hold-1"]["samples"]
     assert configs["g1-ball-hold-1"]["practise"] == ["hold"] and not configs["g1-ball-all-1"]["practise"]
     before = {p: p.read_text() for p in tmp_path.glob("*/curve.jsonl")}
     mixture.main()
-    assert {p: p.read_text() for p in tmp_path.glob("*/curve.jsonl")} == before and len(before) == 6
+    assert {p: p.read_text() for p in tmp_path.glob("*/curve.jsonl")} == before and len(before) == SKILLS + 1

@@ -174,7 +174,9 @@ def test_both_arms_are_corrected_alike_but_for_a_dribble(graph):
         assert moved == ({"right"} if label == "dribble_in_place" else {"left", "right"})
         assert search.count == (1 if label in graph.config.swing else KNOTS)
         expected = np.arange(1.0, size + 1)
-        if label != "dribble_in_place":  # palms tip, and the base walks, only after a ball that comes again and again
+        if (
+            label not in graph.config.loop
+        ):  # palms tip, and the base walks, only after a ball that comes again and again
             expected[-11:-7] = expected[-4:] = 0.0
         np.testing.assert_allclose(search.vector(c), expected, atol=1e-9)
 
@@ -230,6 +232,18 @@ def test_arms_are_told_of_the_weight_of_the_ball_and_of_what_speeds_it_up(graph)
         up += np.linalg.pinv(jacobian[:, 6:-6] * arms) @ [0.0, 0.0, 1.0]
     assert (held - empty) @ up == pytest.approx(MASS * 9.81, rel=1e-3)
     assert (falling - empty) @ up == pytest.approx(0.0, abs=0.01)
+
+
+def test_two_palms_follow_a_ball_on_its_way_up_and_not_when_they_have_it(graph):
+    k = graph.labels.index("bounce")
+    rows = graph.clips.plan(k, graph.acting, 0.0)
+    moves = np.abs(rows.back[:, :, :3]).max(axis=(1, 2))
+    falls, rises = rows.velocity[:, 2] < -1.5, rows.velocity[:, 2] > 1.5
+    met = int(np.flatnonzero(rises)[-1])
+    assert (moves[falls] == 0).all() and (np.diff(moves[rises]) > 0).all()
+    assert moves[met] > 1.0  # rad per m
+    after = met + np.arange(30)
+    assert moves[after].argmin() > 10 and (moves[after[-5:]] == 0).all() and (moves[:3] == 0).all()
 
 
 def test_a_tipped_palm_turns_and_stays_where_it_is(graph):

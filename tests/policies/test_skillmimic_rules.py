@@ -69,3 +69,24 @@ def test_dribbling_counts_frames_of_all_that_were_due():
 def test_a_ball_nobody_touches_any_more_is_not_dribbled():
     once = np.arange(200) == 0
     assert succeeded("dribble_in_place", trace(once), PERIOD, 200) == pytest.approx(0.5)
+
+
+def bounces(count: int, rises: int = 8) -> Trace:
+    """A ball that comes up from the floor for ``rises`` ticks in every 90, ``count`` times, and is held in between."""
+    held, up = np.ones(90 * count, bool), np.zeros(90 * count)
+    for k in range(count):
+        held[90 * k : 90 * k + 40], up[90 * k + 20 : 90 * k + 20 + rises] = False, 3.0
+    t = trace(held)
+    t.ball_velocity[:, 2] = up
+    return t
+
+
+def test_bouncing_counts_frames_that_are_not_long_after_a_bounce():
+    assert succeeded("bounce", bounces(4), PERIOD, 360) == 1
+    assert succeeded("bounce", bounces(4), PERIOD, 720) == 0.5
+
+
+def test_who_only_holds_a_ball_does_not_bounce_it():
+    held = trace(holds(360, 0))
+    held.ball_velocity[:, 2] = 3.0  # in the hands
+    assert succeeded("bounce", held, PERIOD, 360) == pytest.approx(100 / 360)

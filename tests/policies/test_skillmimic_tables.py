@@ -68,6 +68,11 @@ def test_pairs_hand_the_ball_from_both_hands_to_both_hands(graph):
     assert pairs(graph) == [("hold", "carry"), ("carry", "hold"), ("catch", "hold"), ("catch", "carry")]
 
 
+def test_a_ball_that_is_bounced_is_handed_to_nobody():
+    bounce = dataclasses.replace(CONFIG, skills=("hold", "bounce"), clips=("hold_05", "bounce_01"))
+    assert pairs(PolicyGraph(bounce)) == [("hold", "bounce")]
+
+
 def test_a_switch_is_told_once_and_judged_by_the_second_skill(graph, monkeypatch):
     monkeypatch.setattr(tables, "FIRST", 0.1)
     monkeypatch.setattr(tables, "SECOND", 0.3)
