@@ -142,7 +142,7 @@ class Stroke:
 class Drop:
     """Both palms from the sides. Nothing is pushed and nothing moves fast: a robot that has to step loses the ball."""
 
-    top: float = 1.06  # m, the ball's centre where it is held
+    top: float = 1.12  # m, the ball's centre where it is held
     along: float = 0.01  # m that the palms fall with it
     follow: float = 0.03  # m in which they then come to rest
     ahead: float = 0.22  # m from the base

@@ -41,7 +41,6 @@ class PolicyGraph(nn.Module):
     acts: Tensor
     poses: Tensor
     walks: Tensor
-    ahead: Tensor
     gaits: Tensor
     spread: Tensor
     lower: Tensor
@@ -78,7 +77,6 @@ class PolicyGraph(nn.Module):
                 self.clips.plan(k, self.acting, PULL * (name in config.timed)) for k, name in enumerate(self.labels)
             ]
             self.plan = Plan(rows, corrections(config.corrections, self.labels, len(self.acting)))
-            self.register_buffer("ahead", torch.eye(2, 3))  # forwards and left, to a command
             labels = list(self.base.labels)
             self.register_buffer("gaits", torch.eye(len(labels))[[labels.index("walk"), labels.index("stand")]])
             self.register_buffer("spread", _buffer(np.eye(len(acts))[self.acting]))  # arms to joints
@@ -176,7 +174,7 @@ class PolicyGraph(nn.Module):
             # The base sees the arms on their way to where they were last sent.
             hands = self.acts * (posture - self.base.home + inputs["carry_action"] @ self.drive)
             pose = skill @ self.poses * (1 - self.acts) + hands
-            command = inputs["command_velocity"] * (skill @ self.walks) + plan.pace @ self.ahead
+            command = inputs["command_velocity"] * (skill @ self.walks)
             given = {n.replace("carry_base", "carry"): v for n, v in inputs.items() if n.startswith("carry_base_")}
             seen = self.base.advance(*joints, orientation, gyro, command, self.gait(command), **given, pose=pose)
             action = self.base.clip(self.base.actor(observe_base(seen)))

@@ -32,8 +32,8 @@ with warnings.catch_warnings():  # that there is no matplotlib
     warnings.simplefilter("ignore", UserWarning)
     import cma
 
-# What is one unit of the search: rad; m, rad, m/s per m; the same per m/s.
-OFFSET, GAIN, DAMP = 0.1, np.repeat([0.4, 0.8, 1.0], [3, 2, 2]), np.repeat([0.04, 0.3, 0.3], [3, 2, 2])
+# What is one unit of the search: rad; m and rad per m; the same per m/s.
+OFFSET, GAIN, DAMP = 0.1, np.repeat([0.4, 0.8], [3, 2]), np.repeat([0.04, 0.3], [3, 2])
 SIGMA = 0.3  # of the first generation, in those units
 QUIET = 1.3  # strokes without a touch, after which a ball is not being dribbled
 
@@ -56,11 +56,9 @@ class Search:
         side = "left" if both or graph.clips.hands[clip, 0] else "right"
         self.free = np.array([name.startswith(side) for name in names])
         self.both = both
-        # Palms tip, and the base walks, only after a ball that comes back again and again.
-        chases = bool(graph.clips.loop[clip])
-        self.unit = np.concatenate(
-            [unit * np.repeat([1.0, chases], [TIPS.start, len(REACH) - TIPS.start]) for unit in (GAIN, DAMP)]
-        )
+        # Palms tip only under a ball that one of them bounces again and again.
+        tips = bool(graph.clips.loop[clip]) and not both
+        self.unit = np.concatenate([unit * np.repeat([1.0, tips], [TIPS.start, 2]) for unit in (GAIN, DAMP)])
 
     def offsets(self, x: np.ndarray) -> np.ndarray:
         """(..., KNOTS, arms) rad of vectors (..., size)."""
@@ -72,7 +70,7 @@ class Search:
         return np.broadcast_to(own, (*x.shape[:-1], KNOTS, arms))
 
     def gains(self, x: np.ndarray) -> np.ndarray:
-        """(..., 14) of vectors (..., size)."""
+        """(..., 10) of vectors (..., size)."""
         return x[..., -2 * len(REACH) :] * self.unit
 
     def correction(self, x: np.ndarray) -> Correction:

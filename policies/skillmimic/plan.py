@@ -23,9 +23,9 @@ from sim2real.types import Sim2realError
 ROOT = Path(__file__).resolve().parents[2]
 GRAVITY = 9.81  # m/s^2
 KNOTS = 8  # of a skill that moves
-# The furthest that palms and base follow the ball: m forwards, left, up; rad tipped forwards, left; m/s forwards, left.
-REACH = np.array([0.15, 0.15, 0.25, 0.5, 0.5, 0.4, 0.4])
-TIPS, PACE = slice(3, 5), slice(5, 7)  # of these
+# The furthest that palms follow the ball: m forwards, left, up; rad tipped forwards, left.
+REACH = np.array([0.15, 0.15, 0.25, 0.5, 0.5])
+TIPS = slice(3, 5)  # of these
 SLOW = 0.5  # m/s: a ball slower than this says little about the time
 # rad a tick: how fast targets go to where a skill begins. Arms that are thrown there throw the robot off its feet.
 APPROACH, AT_ONCE = 0.04, 10.0
@@ -36,9 +36,9 @@ class Correction(NamedTuple):
 
     offsets: np.ndarray  # (KNOTS, arms) rad, added to targets; all alike for a skill that holds still
     # What is in REACH per m that the ball is off: palms go after it, and tip with how far it is ahead or to the left, so
-    # that they push it back; the base goes after it too.
-    follow: np.ndarray  # (7,)
-    damp: np.ndarray  # (7,) the same per m/s
+    # that they push it back.
+    follow: np.ndarray  # (5,)
+    damp: np.ndarray  # (5,) the same per m/s
 
 
 @dataclass
@@ -69,7 +69,6 @@ class Planned(NamedTuple):
     target: Tensor  # (N, arms) rad
     clock: Tensor  # (N, 1) rows since the skill's beginning
     ball_error: Tensor  # (N, 6) m and m/s from where the plan has the ball
-    pace: Tensor  # (N, 2) m/s forwards and left, of the base, beside what it is told
 
 
 class Plan(nn.Module):
@@ -111,7 +110,7 @@ class Plan(nn.Module):
         self.register_buffer("reach", _buffer(REACH))
 
     def corrections(self, skill: Tensor) -> tuple[Tensor, Tensor]:
-        """Offsets (N, KNOTS, arms) and gains (N, 14) of each robot's skill (N, labels)."""
+        """Offsets (N, KNOTS, arms) and gains (N, 10) of each robot's skill (N, labels)."""
         offsets = skill @ self.offsets.flatten(1)  # a matrix product: the runtime knows no einsum
         return offsets.unflatten(1, self.offsets.shape[1:]), skill @ self.follow
 
@@ -132,16 +131,15 @@ class Plan(nn.Module):
         error = ball - planned[:, self.arms : self.arms + 6]
         offsets, gains = self.corrections(skill)
         place, speed = error[:, :3], error[:, 3:]
-        reads = [place, place[:, :2], place[:, :2], speed, speed[:, :2], speed[:, :2]]
-        moved = torch.cat(reads, dim=-1) * gains
+        moved = torch.cat([place, place[:, :2], speed, speed[:, :2]], dim=-1) * gains
         waits = (rate <= 0) & (same > 0) & (loop == 0)  # for a ball that is still somewhere else
-        wanted = moved[:, : PACE.stop] + moved[:, PACE.stop :]
+        wanted = moved[:, : TIPS.stop] + moved[:, TIPS.stop :]
         wanted = torch.where(waits, 0.0, torch.minimum(torch.maximum(wanted, -self.reach), self.reach))
         target = planned[:, : self.arms] + (mixed(self.knots)[:, :, None] * offsets).sum(dim=1)
-        target = target + (self.back[row] * wanted[:, None, : TIPS.stop]).sum(dim=-1)
+        target = target + (self.back[row] * wanted[:, None]).sum(dim=-1)
         step = torch.where((clock < 1) & (loop == 0), APPROACH, AT_ONCE)
         target = last_target + torch.minimum(torch.maximum(target - last_target, -step), step)
-        return Planned(target, clock, error, wanted[:, PACE])
+        return Planned(target, clock, error)
 
     def _step(
         self, skill: Tensor, clock: Tensor, same: Tensor, last: Tensor, loop: Tensor, ball: Tensor
