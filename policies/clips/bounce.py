@@ -59,7 +59,7 @@ class Bounce(Protocol):
         ...
 
     def path(self, radius: float, t: np.ndarray) -> Path:
-        """At times ``t`` (T,) s since the ball was last at rest in the hands."""
+        """At times ``t`` (T,) s since a bounce began: the ball is at its peak, and in the hands."""
         ...
 
 
@@ -165,8 +165,9 @@ class Drop:
         return replace(self, rest=self.rest + period - self.period(radius))
 
     def path(self, radius: float, t: np.ndarray) -> Path:
+        """It begins where the ball is caught, which is near where it is otherwise held."""
         flight = self.flight(radius)
-        t = np.mod(t, self.period(radius))
+        t = np.mod(t + flight.period, self.period(radius))
         f, left = t - flight.push, flight.period - t  # since the palms let go, and until they are back
         away, u, lift = (f > 0) & (left > 0), np.clip(-left / self.lift, 0, 1), flight.top - flight.peak
         z, v = flight.at(np.minimum(t, flight.period))

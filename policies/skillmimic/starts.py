@@ -46,9 +46,9 @@ def object_start(graph: PolicyGraph, clip: int) -> dict[str, Any]:
 
 
 def _in_hands(graph: PolicyGraph, clip: int) -> np.ndarray:
-    """(3,) m in the base: the ball of clip number ``clip``, mean while hands are on it."""
+    """(3,) m in the base: the ball of clip number ``clip``, mean while hands are on it; of one that begins again, there."""
     clips = graph.clips
-    rows = clips.first[clip] + np.arange(clips.length[clip])
+    rows = clips.first[clip] + np.arange(1 if clips.loop[clip] else clips.length[clip])
     m = clips.motion(rows, np.ones(len(rows)))
     place = rotate(conjugate(m.orientation_base_in_world), m.object_position - m.points[:, 0])
     return place[m.contact[:, 0] > 0].mean(axis=0)

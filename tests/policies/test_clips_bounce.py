@@ -49,7 +49,7 @@ def test_palms_from_the_sides_are_open_while_the_ball_passes_between_them():
     motion = Drop()
     k = motion.flight(R)
     t = np.linspace(0, k.period, 2001)
-    path = motion.path(R, t)
+    path = motion.path(R, t - k.period)  # it begins with the peak
     passes = (t > k.push + motion.opening) & (t < k.period - motion.closing)
     np.testing.assert_allclose(path.apart[passes], motion.open)
     assert (np.diff(path.apart[t < k.push + motion.opening]) >= 0).all()
