@@ -172,7 +172,9 @@ class Env(VecEnv):
         self.since += self.substeps
         if self.graph.base is not None:
             clock = self.carries["carry_clock"][:, 0].numpy()
-            self.row = np.where(self._timed[self.clip], np.round(clock * self.substeps).astype(int), self.row)
+            self.row = np.where(
+                self._timed[self.clip], np.round(np.maximum(clock, 0) * self.substeps).astype(int), self.row
+            )
 
     def _aim(self) -> None:
         """Whoever throws holds the ball where it will fly from, in front of a base that may move, until they let go."""

@@ -67,7 +67,7 @@ class Planned(NamedTuple):
     """This tick of every robot."""
 
     target: Tensor  # (N, arms) rad
-    clock: Tensor  # (N, 1) rows since the skill's beginning
+    clock: Tensor  # (N, 1) rows since the skill's beginning; negative while arms are on their way to it
     ball_error: Tensor  # (N, 6) m and m/s from where the plan has the ball
 
 
@@ -122,8 +122,8 @@ class Plan(nn.Module):
         same = (skill * last_skill).sum(dim=-1, keepdim=True)
         last, loop = skill @ self.last, skill @ self.loop
         clock, rate = self._step(skill, same * last_clock, same, last, loop, ball)
-        here = torch.floor(clock)
-        share = clock - here
+        here = torch.clamp(torch.floor(clock), min=0.0)
+        share = torch.clamp(clock, min=0.0) - here
         row = (skill @ self.first + here)[:, 0].to(torch.int64)
         following = self.following[row]
         mixed = lambda t: t[row] + share * (t[following] - t[row])  # noqa: E731
@@ -137,7 +137,9 @@ class Plan(nn.Module):
         wanted = torch.where(waits, 0.0, torch.minimum(torch.maximum(wanted, -self.reach), self.reach))
         target = planned[:, : self.arms] + (mixed(self.knots)[:, :, None] * offsets).sum(dim=1)
         target = target + (self.back[row] * wanted[:, None]).sum(dim=-1)
-        step = torch.where((clock < 1) & (loop == 0), APPROACH, AT_ONCE)
+        far = (target - last_target).abs().amax(dim=-1, keepdim=True)
+        clock = torch.where((same == 0) & (loop > 0), -far / APPROACH, clock)  # a ball in the hands comes along
+        step = torch.where((clock < 0) | ((clock < 1) & (loop == 0)), APPROACH, AT_ONCE)
         target = last_target + torch.minimum(torch.maximum(target - last_target, -step), step)
         return Planned(target, clock, error)
 
@@ -149,7 +151,7 @@ class Plan(nn.Module):
         A ball that is caught is where the plan has it, sooner or later. One that bounces may never get that high; its
         velocity tells the time, and that jumps back by ``bounce`` s on the floor.
         """
-        row = (skill @ self.first + torch.floor(clock))[:, 0].to(torch.int64)
+        row = (skill @ self.first + torch.clamp(torch.floor(clock), min=0.0))[:, 0].to(torch.int64)
         planned = self.table[row][:, self.arms :]
         velocity = planned[:, 3:6]
         along = ((ball[:, :3] - planned[:, :3]) * velocity).sum(-1, keepdim=True)
@@ -159,7 +161,7 @@ class Plan(nn.Module):
         ahead = torch.where(loop > 0, fallen - bounce * torch.round(fallen / bounce), along)  # s
         rate = torch.clamp(same + planned[:, 6:] * ahead, 0.0, 2.0)
         moved = clock + rate
-        around = moved - (last + 1) * torch.floor(moved / (last + 1))
+        around = moved - (last + 1) * torch.clamp(torch.floor(moved / (last + 1)), min=0.0)
         return torch.where(loop > 0, around, torch.minimum(moved, last)), rate
 
 

@@ -96,7 +96,7 @@ class Judge:
     def _now(self, policy: Any) -> float | None:
         """How far the plan is, in ticks, of a skill whose plan waits for its ball."""
         waits = self.graph.base is not None and self.label in self.graph.config.timed
-        return float(policy.carries["carry_clock"][0]) if waits else None
+        return max(0.0, float(policy.carries["carry_clock"][0])) if waits else None
 
     def _comparable(self, state: Motion, reference: Motion, qvel: np.ndarray, body: _Body) -> tuple[Motion, Motion]:
         """Both where training compares them: seen from the trunk if the legs are a base policy's, else laid on the clip."""
