@@ -35,6 +35,9 @@ SMOOTHING = 0.5  # frames
 TICK = 0.02  # s of a policy: a bounce lasts some of them
 SETTLING = 3  # bounces before the one that is kept: then inverse kinematics has forgotten where it began
 KNEES = 0.35  # rad, bent: as the robot stands at home
+# m/rad, what a turned hand counts beside one that is elsewhere: a palm that pushes throws the ball where it looks; palms
+# that hold it may turn, and then no joint has to be fast.
+LEVEL, UPRIGHT = 0.1, 0.03
 
 
 class Path(NamedTuple):
@@ -187,14 +190,14 @@ def dribble(body: RobotBody, name: str, side: str, stroke: Stroke = Stroke()) ->
     """One stroke of ``side``'s hand, from peak to peak, its palm looking down."""
     ahead, aside = stroke.place
     place = (ahead, aside if side == "left" else -aside)
-    return _clip(body, name, stroke, place, {side: mink.SO3.from_x_radians(np.pi)}, 0.1, f"{side} hand")
+    return _clip(body, name, stroke, place, {side: mink.SO3.from_x_radians(np.pi)}, LEVEL, f"{side} hand")
 
 
 def bounce(body: RobotBody, name: str, drop: Drop = Drop()) -> Clip:
     """One bounce with both hands, from rest to rest, palms looking at each other."""
     down, towards = mink.SO3.from_y_radians(drop.fingers), {"left": np.pi / 2, "right": -np.pi / 2}
     facing = {side: down @ mink.SO3.from_x_radians(angle) for side, angle in towards.items()}
-    return _clip(body, name, drop, (drop.ahead, 0.0), facing, 0.03, "both hands")
+    return _clip(body, name, drop, (drop.ahead, 0.0), facing, UPRIGHT, "both hands")
 
 
 def _clip(

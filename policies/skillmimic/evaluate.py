@@ -53,9 +53,7 @@ class Trace(NamedTuple):
 LENGTH = 0.745  # of the G1, over a person's: distances of the paper's rules times this
 ASIDE, LEAST = np.deg2rad(20.0), 1.5  # rad off the commanded direction, and m/s forwards, of a ball that was thrown
 HELD = 0.5  # s at the end of an episode during which a caught ball is held
-LIVELY = (
-    2.0  # s after its last touch for which a ball is being dribbled, and after its last bounce for which it is bounced
-)
+LIVELY = 2.0  # s for which a ball is being dribbled after its last touch, and bounced after it last came from the floor
 BOUNCED = 1.0  # m/s upwards of a ball that nobody touches: it comes from the floor
 
 

@@ -58,7 +58,9 @@ class Search:
         self.both = both
         # Palms tip only under a ball that one of them bounces again and again.
         tips = bool(graph.clips.loop[clip]) and not both
-        self.unit = np.concatenate([unit * np.repeat([1.0, tips], [TIPS.start, 2]) for unit in (GAIN, DAMP)])
+        self.unit = np.concatenate(
+            [unit * np.repeat([1.0, tips], [TIPS.start, len(REACH) - TIPS.start]) for unit in (GAIN, DAMP)]
+        )
 
     def offsets(self, x: np.ndarray) -> np.ndarray:
         """(..., KNOTS, arms) rad of vectors (..., size)."""
