@@ -87,21 +87,28 @@ def evaluate(
     policy = load_policy(path, trial=0)
     graph = graph_of(policy.contract)
     tell(f"training environment, {episodes} episodes a skill")
-    actor = BallActor(path, episodes)
+    trained = spread(in_training, [(path, n, episodes) for n in graph.labels])
     results = {
-        "training": {n: evaluate_skill(graph, n, episodes, SECONDS, seed=1, act=actor) for n in graph.labels},
+        "training": dict(zip(graph.labels, trained, strict=True)),
         "truth": through_bytes(path, graph, deployed, None, tell),
         "camera": through_bytes(path, graph, deployed, CameraModel(), tell),
     }
     if not tables:
         return Evaluation(policy.sha256, results)
     each = max(1, min(CELL, episodes // 5))
+    actor = BallActor(path, each)
     return Evaluation(
         policy.sha256,
         results,
         sweeps(graph, each, SECONDS, actor, tell),
         switches(graph, each, actor, tell),
     )
+
+
+def in_training(path: Path, label: str, episodes: int) -> Result:
+    """``episodes`` of one skill of a policy file in training's world."""
+    graph = graph_of(load_policy(path, trial=0).contract)
+    return evaluate_skill(graph, label, episodes, SECONDS, seed=1, act=BallActor(path, episodes))
 
 
 def through_bytes(
