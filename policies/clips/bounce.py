@@ -172,7 +172,8 @@ class Drop:
         flight = self.flight(radius)
         t = np.mod(t + flight.period, self.period(radius))
         f, left = t - flight.push, flight.period - t  # since the palms let go, and until they are back
-        away, u, lift = (f > 0) & (left > 1e-9), np.clip(-left / self.lift, 0, 1), flight.top - flight.peak
+        away = (f > 0) & (left > 1e-9)  # in the first frame hands have the ball, whatever rounding says
+        u, lift = np.clip(-left / self.lift, 0, 1), flight.top - flight.peak
         z, v = flight.at(np.minimum(t, flight.period))
         z, v = z + lift * _eased(u), v + lift / self.lift * 30 * u**2 * (1 - u) ** 2
         palm = flight.palms(t, self.follow, self.closing, _eased)

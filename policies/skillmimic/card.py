@@ -17,7 +17,7 @@ from policies.skillmimic.evaluate import BALL_NEAR, BODY_NEAR, Result, evaluate_
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.release import graph_of
 from policies.skillmimic.tables import FIRST, NOMINAL, REST, SECOND, sweeps, switches
-from policies.skillmimic.through_bytes import BEFORE, judged
+from policies.skillmimic.through_bytes import BEFORE, graph_in, judged
 from policies.spread import spread
 from sim2real.contract import Contract
 from sim2real.object.camera import CameraModel
@@ -107,8 +107,7 @@ def evaluate(
 
 def in_training(path: Path, label: str, episodes: int) -> Result:
     """``episodes`` of one skill of a policy file in training's world."""
-    graph = graph_of(load_policy(path, trial=0).contract)
-    return evaluate_skill(graph, label, episodes, SECONDS, seed=1, act=BallActor(path, episodes))
+    return evaluate_skill(graph_in(path), label, episodes, SECONDS, seed=1, act=BallActor(path, episodes))
 
 
 def through_bytes(

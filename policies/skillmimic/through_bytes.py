@@ -237,12 +237,13 @@ def judged(
     path: Path, clip: int, seconds: float, camera: CameraModel | None, seed: int
 ) -> tuple[float, np.ndarray, int]:
     """Success, sums of Measures (4,) and frames of a ``deploy_episode`` of a policy file."""
-    judge = deploy_episode(path, _graph(path), clip, seconds, camera, seed)
+    judge = deploy_episode(path, graph_in(path), clip, seconds, camera, seed)
     return judge.success, judge.sums, judge.frames
 
 
 @functools.lru_cache(maxsize=1)
-def _graph(path: Path) -> PolicyGraph:
+def graph_in(path: Path) -> PolicyGraph:
+    """That a policy file was exported from, without its actor, built once a process."""
     return graph_of(load_policy(path, trial=0).contract)
 
 
