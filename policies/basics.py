@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from policies.gait import Stride
 from policies.references import Motion
@@ -43,6 +46,33 @@ MOTIONS: dict[str, Motion] = {
     "walk": Motion("Walk as commanded: forwards, sideways, turning", period=1.0, walks=True),
 }
 
+# To the floor, and there a ball's breadth between the hands: angles beyond the home pose where the hands are there, and
+# those on top of it half-way down, which keep the centre of mass 3 to 5 cm before the ankles. The pelvis pitches by 0.6 rad.
+DOWN: tuple[dict[str, float], dict[str, float]] = (
+    {
+        **both("hip_pitch", -2.314),
+        **both("knee", 2.049),
+        **both("ankle_pitch", -0.335),
+        **both("shoulder_pitch", -1.327),
+        **both("shoulder_roll", -0.066, mirrored=True),
+        **both("shoulder_yaw", 0.182, mirrored=True),
+        **both("elbow", 0.361),
+        **both("wrist_roll", -0.062, mirrored=True),
+        **both("wrist_pitch", 0.281),
+        **both("wrist_yaw", 0.113, mirrored=True),
+        "waist_pitch_joint": 0.361,
+    },
+    {**both("hip_pitch", 0.12), **both("ankle_pitch", -0.12)},
+)
+BOWED = 0.6  # rad that it is pitched
+
+
+def down(joint_names: Sequence[str], share: np.ndarray) -> np.ndarray:
+    """(N, n) rad, what being ``share`` (N,) of the way ``DOWN`` adds to the home pose."""
+    way = np.array([[angles.get(name, 0.0) for name in joint_names] for angles in DOWN])
+    share = share[:, None]
+    return share * way[0] + 4 * share * (1 - share) * way[1]
+
 
 @dataclass(frozen=True)
 class Basics:
@@ -63,6 +93,13 @@ class Basics:
     balance_offset: float = 0.19  # rad
     balance_gain: float = 2.3  # rad of ankle per rad of pitch
     balance_damping: float = 0.25  # rad per rad/s
+    # The same for who has gone down, where legs are soft and cannot step; in full at BOWED. Rad per rad of roll, and per
+    # rad/s, by which one leg bends and the other stretches, and hips roll; rad of hips per rad of pitch; and rad that joints
+    # are sent further. Found by CMA-ES; any one of the first three alone would do nearly as well.
+    bow_legs: tuple[float, float] = (1.7, 0.04)
+    bow_hips: tuple[float, float] = (-1.8, -0.09)
+    bow_pitch: float = 0.7
+    bow_lean: tuple[float, float, float, float] = (-0.18, 0.25, -0.24, -0.06)  # hips, knees, ankles, waist
     stride: Stride = Stride()
     reference_rate: float = 2.5  # rad/s, the fastest a reference moves
     reference_pull: float = 8.0  # 1/s, how eagerly it moves towards its goal
@@ -82,6 +119,9 @@ class Basics:
     busy_arms: float = 1.2  # rad from the formula's pose, the furthest
     busy_waist: float = 0.25  # rad
     busy_crouch: float = 0.4  # of a full squat
+    # the share of episodes in which a standing robot goes down to the floor and up again, and how fast
+    down: float = 0.0
+    down_in: tuple[float, float] = (1.0, 3.0)  # s, all the way
     command_low: tuple[float, float, float] = (-0.4, -0.3, -0.8)  # m/s, m/s, rad/s
     command_high: tuple[float, float, float] = (0.8, 0.3, 0.8)
     command_zero: float = 0.15  # share of commands that are none
@@ -106,7 +146,15 @@ class Basics:
         }
     )
     std: float = 0.2  # of the actions at the start
+    std_again: float = 0.0  # at least, of a start from another run's networks
     # checkpoints and evaluation, in iterations
     save_every: int = 200
     evaluate_every: int = 80
     evaluate_envs: int = 64
+
+
+TASKS: dict[str, Basics] = {
+    "g1-basics": Basics(),
+    # who goes down to the floor; to be started from the basics
+    "g1-down": Basics(seed=4, down=0.35, learning_rate=2e-4, samples=5e6, std_again=0.07),
+}

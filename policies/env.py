@@ -10,10 +10,10 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
-from policies.basics import Basics
+from policies.basics import Basics, down
 from policies.graph import PolicyGraph, one_hot
-from policies.observations import gravity_in_base, observe
-from policies.physics import standing_height, training_model
+from policies.observations import gravity_in_base, observe, pitched
+from policies.physics import Stature, training_model
 from policies.randomisation import Randomisation
 from policies.rewards import Tick, reward
 from policies.terminations import failed
@@ -51,7 +51,7 @@ class Env(VecEnv):
             "qpos": np.zeros((n, self.substeps, self.model.nq)),
             "qvel": np.zeros((n, self.substeps, self.model.nv)),
         }
-        self._height = self._height_table()
+        self.stature = Stature(self.model, robot.home_pos)
         labels = len(self.graph.labels)
         self.skill, self.command = torch.zeros(n, labels), torch.zeros(n, 3)
         self.carries = {k: torch.zeros(n, *v) for k, v in self.graph.inputs().items() if k.startswith("carry_")}
@@ -61,6 +61,9 @@ class Env(VecEnv):
         self._reach = config.busy_arms * (group == "arm") + config.busy_waist * (group == "waist")
         squat = self.graph.references.lift[self.graph.labels.index("squat")].numpy()
         self._crouch = config.busy_crouch * squat * (group == "leg")
+        # How far down each robot is, where it is going and how fast, a tick; all in shares of the way.
+        self._down, self._down_goal, self._down_speed = np.zeros((3, n))
+        self._goes_down = np.zeros(n, bool)
         self._switch_in, self._push_in, self._busy_in = np.zeros((3, n), np.int64)
         self.observation = torch.zeros(0)
         self._command(np.arange(n))
@@ -133,13 +136,15 @@ class Env(VecEnv):
         return Tick(
             joint_pos=qpos[:, 7:],
             joint_vel=qvel[:, 6:],
-            gravity_in_base=gravity_in_base(torch.from_numpy(qpos[:, 3:7])).numpy(),
+            gravity_in_base=pitched(
+                gravity_in_base(torch.from_numpy(qpos[:, 3:7])), _tensor(self.stature.pitch(posture)[:, None])
+            ).numpy(),
             velocity=np.column_stack([cos * vx + sin * vy, cos * vy - sin * vx]),
             command=seen.command.numpy(),
             angular_velocity_base_in_base=qvel[:, 3:6],
             resting=self.graph.gait.resting(seen.gait)[:, 0].numpy().astype(float),
             height=qpos[:, 2],
-            height_reference=np.interp(posture[:, self._knee], *self._height),
+            height_reference=self.stature.height(posture),
             reference=reference,
             action=self.action.numpy(),
             last_action=last_action.numpy(),
@@ -165,7 +170,7 @@ class Env(VecEnv):
             "command_velocity": self.command.clone(),
             "skill": self.skill.clone(),
         }
-        self.measured = self.graph.advance(**self.signals, **self.carries, pose=self.pose)
+        self.measured = self.graph.advance(**self.signals, **self.carries, pose=self.pose + self._reaching())
         self.observation = observe(self.measured)
 
     # between periods
@@ -178,18 +183,20 @@ class Env(VecEnv):
             self.skill = one_hot(self.script[np.arange(self.num_envs), ticks], len(self.graph.labels))
         else:
             self._switch_in -= 1
-            now = np.flatnonzero(self._switch_in <= 0)
+            now = np.flatnonzero((self._switch_in <= 0) & ~self._goes_down)
             self.skill[now] = one_hot(rng.integers(len(self.graph.labels), size=len(now)), len(self.graph.labels))
             self._switch_in[now] = self._ticks(config.switch, len(now))
             self._command(now)
             self._busy_in -= 1
             self._occupy(np.flatnonzero(self._busy_in <= 0))
+            self._down += np.clip(self._down_goal - self._down, -self._down_speed, self._down_speed)
         if self.level is None:
             return
         self._push_in -= 1
         now = np.flatnonzero(self._push_in <= 0)
         low, high = config.push_speed
         speed = rng.uniform(config.push_least, 1.0, len(now)) * (low + (high - low) * self.level)
+        speed *= 1 - 0.9 * self._down[now]  # who is down cannot step
         heading = rng.uniform(-np.pi, np.pi, len(now))
         self._qvel[now, 0] += speed * np.cos(heading)
         self._qvel[now, 1] += speed * np.sin(heading)
@@ -210,8 +217,16 @@ class Env(VecEnv):
             return
         config, rng, k = self.config, self.rng, len(ids)
         pose = rng.uniform(-1, 1, (k, self.model.nu)) * self._reach + rng.uniform(0, 1, (k, 1)) * self._crouch
-        self.pose[ids] = _tensor(pose * (rng.random((k, 1)) < config.busy) * self._difficulty)
+        goes = self._goes_down[ids]
+        busy = (rng.random(k) < config.busy) & ~goes
+        self.pose[ids] = _tensor(pose * busy[:, None] * self._difficulty)
         self._busy_in[ids] = self._ticks(config.busy_every, k)
+        self._down_goal[ids] = goes * np.clip(rng.uniform(-0.4, 1.4, k), 0, 1)
+        self._down_speed[ids] = config.period / rng.uniform(*config.down_in, k)
+
+    def _reaching(self) -> Tensor:
+        """(envs, n) rad, what the way to the floor adds to the pose."""
+        return _tensor(down(self.graph.joint_names, self._down))
 
     @property
     def _difficulty(self) -> float:
@@ -231,9 +246,12 @@ class Env(VecEnv):
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         home = np.full(k, True) if self.script is not None else rng.random(k) < config.home_start
         label = self.script[ids, 0] if self.script is not None else rng.integers(labels, size=k)
+        self._goes_down[ids] = goes = (self.script is None) & (rng.random(k) < config.down)
+        label = np.where(goes, self.graph.labels.index("stand"), label)
+        self._down[ids] = goes * ~home * rng.random(k)
         skill, phase = one_hot(label, labels), _tensor(rng.random((k, 1)))
         at_home = torch.from_numpy(home)[:, None]
-        pose = torch.where(at_home, self.graph.home, self.graph.references.goal(skill, phase))
+        pose = torch.where(at_home, self.graph.home, self.graph.references.goal(skill, phase)) + self._reaching()[ids]
         self.skill[ids] = skill
         for carry in self.carries.values():
             carry[ids] = 0.0
@@ -248,11 +266,12 @@ class Env(VecEnv):
             self._occupy(ids)
         joint_pos = np.clip(pose.numpy() + rng.uniform(-0.05, 0.05, pose.shape), *self.model.jnt_range[1:].T)
         yaw, tilt = rng.uniform(-np.pi, np.pi, k), rng.uniform(-0.04, 0.04, (k, 2))
+        tilt[:, 1] += self.stature.pitch(pose.numpy())
         orientation = multiply(
             np.column_stack([np.cos(yaw / 2), np.zeros((k, 2)), np.sin(yaw / 2)]),
-            np.column_stack([np.ones(k), tilt / 2, np.zeros(k)]),
+            np.column_stack([np.cos(tilt[:, 1] / 2), np.sin(tilt / 2), np.zeros(k)]),
         )
-        height = np.interp(pose[:, self._knee].numpy(), *self._height) + rng.uniform(0.0, 0.015, k)
+        height = self.stature.height(pose.numpy()) + rng.uniform(0.0, 0.015, k)
         self._qpos[ids] = np.column_stack([np.zeros((k, 2)), height, orientation, joint_pos])
         self._qvel[ids] = rng.uniform(-0.1, 0.1, (k, self.model.nv))
         self._recorded["qpos"][ids] = self._qpos[ids, None]
@@ -263,14 +282,6 @@ class Env(VecEnv):
 
     def _ticks(self, seconds: tuple[float, float], k: int) -> np.ndarray:
         return np.round(self.rng.uniform(*seconds, k) / self.config.period).astype(np.int64)
-
-    def _height_table(self) -> tuple[np.ndarray, np.ndarray]:
-        """Knee angle -> base height along the squat, the only motion that moves the legs."""
-        self._knee = self.graph.joint_names.index("left_knee_joint")
-        depth = np.linspace(0.0, 1.0, 25)[:, None]
-        squat = self.graph.references.lift[self.graph.labels.index("squat")].numpy()
-        poses = self.graph.home.numpy() + depth * squat
-        return poses[:, self._knee], standing_height(self.model, poses)
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -161,11 +161,28 @@ def random_script(
 
 
 def quick_survival(config: Basics, graph: PolicyGraph) -> dict[str, float]:
-    """The two rates that training selects by: 10 s of random skills, without and with pushes up to 0.5 m/s."""
+    """The rates that training selects by: 10 s of random skills, without and with pushes up to 0.5 m/s; and, where robots go
+    down to the floor, of those."""
     script = random_script(config, len(graph.labels), config.evaluate_envs, 10.0)
     calm, pushed = (run_episodes(config, graph_actor(graph), script, push) for push in (0.0, 0.5))
+    low = {} if config.down == 0 else {"survival_down": down_survival(config, graph).value}
     return {
         "survival": calm.rate().value,
         "survival_pushed": pushed.rate().value,
         "joint_error": float(calm.error.mean()),
+        **low,
     }
+
+
+def down_survival(config: Basics, graph: PolicyGraph, seed: int = 0) -> Rate:
+    """Of ``config.evaluate_envs`` robots that stand and for one episode go some way down to the floor and up, again and
+    again."""
+    config = dataclasses.replace(config, envs=config.evaluate_envs, down=1.0, home_start=1.0)
+    env, act = Env(config, UNSEEN + seed, level=None), graph_actor(graph)
+    env.episode_length_buf[:] = 0
+    survived = np.full(env.num_envs, True)
+    with torch.no_grad():
+        for _ in range(env.max_episode_length - 1):
+            env.step(act(env))
+            survived &= ~env.failures
+    return Rate(int(survived.sum()), len(survived))

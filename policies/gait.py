@@ -41,6 +41,7 @@ class Stride:
     calm: float = 0.5  # share of these below which the clock may rest
     patience: float = 0.06  # s over which the capture point is averaged before that counts, for speeds are noisy ...
     alarm: float = 1.5  # ... unless it is so many times as far
+    bow: float = 0.15  # rad that a pose pitches the base, beyond which the feet stay: bent legs cannot step
     acceleration: float = 1.2  # m/s^2 (rad/s^2) of a command
     idle: float = 0.05  # m/s (rad/s): a smaller command is none
 
@@ -54,6 +55,8 @@ PARTS: dict[str, dict[str, float]] = {
     "turn": {"hip_yaw": 1.0},
     "pitch": {"hip_pitch": 1.0},
     "roll": {"hip_roll": 1.0},
+    # half of how far a flat sole pitches the base back
+    "sole": {"hip_pitch": 0.5, "knee": 0.5, "ankle_pitch": 0.5},
 }
 MEASURED = "line", "roll"
 MOVED = "raise", "forward", "aside", "turn", "pitch", "roll"
@@ -90,8 +93,14 @@ class Gait(nn.Module):
         self.register_buffer("lines", torch.cat([of[part] for part in MEASURED]).T.contiguous())
         self.basis: Tensor  # (2 parts + 1 + 2, n): what steps do, by leg; both legs aside; what one leg bears
         self.register_buffer("basis", torch.cat([*(of[part] for part in MOVED), of["aside"].sum(0)[None], loads]))
+        self.soles: Tensor  # (n, 1)
+        self.register_buffer("soles", of["sole"].sum(0)[:, None])
         self.sides: Tensor
         self.register_buffer("sides", torch.tensor([[-1.0, 1.0]]))
+
+    def pitch(self, bend: Tensor) -> Tensor:
+        """How far the base of a pose with flat soles is pitched forwards (N, 1) rad, ``bend`` (N, n) rad from a level one."""
+        return -bend @ self.soles
 
     def ramp(self, last: Tensor, command: Tensor) -> Tensor:
         """The command (N, 3) that is followed now: ``command``, approached at ``stride.acceleration``."""
@@ -100,7 +109,7 @@ class Gait(nn.Module):
 
     def lean(self, phase: Tensor, gravity: Tensor, gyro: Tensor, bend: Tensor, joint_vel: Tensor) -> Lean:
         """From the legs that stand: left, right or, at rest, both. ``gravity`` (N, 3) and ``gyro`` (N, 3) rad/s in the
-        base, ``bend`` (N, n) rad of the joints from the pose that is stood in."""
+        base, ``bend`` (N, n) rad of the joints, ``gravity`` and ``bend`` from the pose that is stood in."""
         left = torch.where(self.resting(phase), 0.5, (phase > 0.5).to(phase.dtype))  # what the left leg bears
         shares = torch.cat([left, 1 - left, left, 1 - left], dim=-1)
         standing = lambda x: (x @ self.lines * shares).unflatten(1, (2, 2)).sum(dim=-1).split(1, dim=-1)  # noqa: E731
@@ -129,15 +138,17 @@ class Gait(nn.Module):
         """Whether both feet are on the ground to stay (N, 1) bool."""
         return (phase == 0.0) | (phase == 0.5)
 
-    def advance(self, phase: Tensor, command: Tensor, lean: Lean, steady: Tensor) -> Tensor:
+    def advance(self, phase: Tensor, command: Tensor, lean: Lean, steady: Tensor, bows: Tensor | float = 0.0) -> Tensor:
         """This tick's phase (N, 1) in [0, 1): the left foot is in the air before 0.5, the right one after it, and at
-        exactly 0 and 0.5 both feet rest. ``command`` (N, 3): forward m/s, left m/s, turn rad/s; ``steady``: see there."""
+        exactly 0 and 0.5 both feet rest. ``command`` (N, 3): forward m/s, left m/s, turn rad/s; ``steady``: see there;
+        ``bows`` (N, 1) rad: how far the pose pitches the base."""
         s = self.stride
         resting = self.resting(phase)
         limit = torch.where(resting, 1.0, s.calm)
         fast = lean.forward_speed.abs() > 0.25 * (2 - limit)  # a step in mid-flight ends only when slow
         falling = self._beyond(steady, limit) | self._beyond(self.capture(lean), s.alarm * limit)
         need = (command.abs().amax(-1, keepdim=True) > s.idle) | falling | (fast & ~resting)
+        need = need & (bows < s.bow)
         unloaded = torch.where(lean.left_speed > 0, 0.5, 0.0)  # pushed to the left: the right foot is light
         moved = torch.where(resting, unloaded, phase) + self.step
         crossed = torch.floor(2 * moved) > torch.floor(2 * torch.where(resting, unloaded, phase) + 1e-6)

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from policies.basics import MOTIONS, Basics
+from policies.basics import BOWED, MOTIONS, Basics
 from policies.gait import Gait, single_loads
-from policies.observations import Signals, gravity_in_base, observe
+from policies.observations import Signals, gravity_in_base, observe, pitched
 from policies.references import References
 from sim2real.config import RobotConfig, load_robot
 
@@ -28,6 +28,7 @@ class PolicyGraph(nn.Module):
     scale: Tensor
     drive: Tensor
     ankles: Tensor
+    bowing: Tensor
     walks: Tensor
     lower: Tensor
     upper: Tensor
@@ -63,6 +64,7 @@ class PolicyGraph(nn.Module):
         loads = single_loads(body, robot.home_pos, self.kp) * np.array([groups[n] == "leg" for n in groups])
         loads -= config.balance_offset * ankles.numpy() * (loads != 0)  # which the ankles are told of anyway
         self.gait = Gait(robot.joint_names, config.period, config.stride, loads)
+        self.register_buffer("bowing", _buffer(bowing(robot.joint_names, config)))
         self.register_buffer("value_healthy", torch.ones(len(self.labels)))
         self.actor: nn.Module = nn.Identity()
         self.critic: nn.Module = nn.Identity()
@@ -92,13 +94,16 @@ class PolicyGraph(nn.Module):
         ``pose`` (N, n) rad moves the goal: what another policy does with the rest of the body."""
         phase, posture = self.references.advance(skill, carry_skill, carry_phase, carry_posture, pose)
         command = self.gait.ramp(carry_command, command_velocity * (skill @ self.walks))
-        gravity = gravity_in_base(orientation_base_in_world)
+        # A pose may pitch the base; what matters is how it is turned from there.
+        pitch, last = self.gait.pitch(posture - self.home), self.gait.pitch(carry_posture - self.home)
+        gravity = pitched(gravity_in_base(orientation_base_in_world), pitch)
+        gyro = angular_velocity_base_in_base - nn.functional.pad((pitch - last) / self.config.period, (1, 1))
         lean = self.gait.lean(carry_gait, gravity, angular_velocity_base_in_base, joint_pos - posture, joint_vel)
         capture = self.gait.steady(carry_capture, lean)
-        gait = self.gait.advance(carry_gait, command, lean, capture)
+        gait = self.gait.advance(carry_gait, command, lean, capture, pitch)
         reference = posture + self.gait.offsets(gait, command, lean)
-        return Signals(joint_pos, joint_vel, gravity, angular_velocity_base_in_base, skill, self.home, phase, posture,
-                       command, gait, capture, reference, carry_action)  # fmt: skip
+        return Signals(joint_pos, joint_vel, gravity, gyro, skill, self.home, phase, posture, command, gait, capture,
+                       reference, carry_action)  # fmt: skip
 
     def target(self, signals: Signals, action: Tensor) -> Tensor:
         """Joint targets (N, n) rad for a clipped ``action`` (N, driven)."""
@@ -106,10 +111,17 @@ class PolicyGraph(nn.Module):
         return torch.minimum(torch.maximum(target, self.lower), self.upper)
 
     def balance(self, signals: Signals) -> Tensor:
-        """What a person does without thinking (N, n) rad: ankles lean against the pitch."""
-        config = self.config
-        pitch, pitch_rate = signals.gravity_in_base[:, 0:1], signals.angular_velocity_base_in_base[:, 1:2]
-        return (config.balance_offset + config.balance_gain * pitch + config.balance_damping * pitch_rate) * self.ankles
+        """What a person does without thinking (N, n) rad: ankles lean against the pitch, and whoever has gone down keeps
+        level with both legs."""
+        config, gyro = self.config, signals.angular_velocity_base_in_base
+        pitch, roll, one = (
+            signals.gravity_in_base[:, 0:1],
+            -signals.gravity_in_base[:, 1:2],
+            torch.ones_like(gyro[:, :1]),
+        )
+        lean = config.balance_offset + config.balance_gain * pitch + config.balance_damping * gyro[:, 1:2]
+        bow = torch.clamp(self.gait.pitch(signals.posture - self.home) / BOWED, 0.0, 1.0)
+        return lean * self.ankles + bow * (torch.cat([roll, gyro[:, 0:1], pitch, one], dim=-1) @ self.bowing)
 
     def clip(self, action: Tensor) -> Tensor:
         return torch.clamp(action, -self.config.action_max, self.config.action_max)
@@ -188,6 +200,25 @@ class PolicyGraph(nn.Module):
             action + 0.0,
             value,
         )
+
+
+def bowing(joint_names: Sequence[str], config: Basics) -> np.ndarray:
+    """(4, n): rad of the joints per rad of roll, per rad/s of it, per rad of pitch, and always, of a robot that is down."""
+    found = np.zeros((4, len(joint_names)))
+    (legs, legs_rate), (hips, hips_rate) = config.bow_legs, config.bow_hips
+    for k, name in enumerate(joint_names):
+        side = 1.0 if name.startswith("left") else -1.0
+        part = name.removeprefix("left_").removeprefix("right_").removesuffix("_joint")
+        bend = side * {"hip_pitch": -1.0, "knee": 2.0, "ankle_pitch": -1.0}.get(part, 0.0)
+        roll = float(part == "hip_roll")
+        parts = ("hip_pitch", "knee", "ankle_pitch", "waist_pitch")
+        found[:, k] = (
+            legs * bend + hips * roll,
+            legs_rate * bend + hips_rate * roll,
+            config.bow_pitch * (part == "hip_pitch"),
+            dict(zip(parts, config.bow_lean, strict=True)).get(part, 0.0),
+        )
+    return found
 
 
 def one_hot(labels: Sequence[int] | np.ndarray, size: int) -> Tensor:

@@ -16,8 +16,8 @@ class Signals(NamedTuple):
 
     joint_pos: Tensor  # rad
     joint_vel: Tensor  # rad/s
-    gravity_in_base: Tensor  # unit vector
-    angular_velocity_base_in_base: Tensor  # rad/s
+    gravity_in_base: Tensor  # unit vector, and
+    angular_velocity_base_in_base: Tensor  # rad/s, both from those of the pose that is stood in
     skill: Tensor  # one-hot
     home: Tensor  # (n,) rad
     phase: Tensor  # (N, 1) in [0, 1), of the skill's motion
@@ -33,6 +33,12 @@ def gravity_in_base(orientation_base_in_world: Tensor) -> Tensor:
     """Unit vector of gravity (N, 3) in the base: R(q)^T (0, 0, -1); upright is (0, 0, -1)."""
     w, x, y, z = orientation_base_in_world.unbind(-1)
     return torch.stack([2 * (w * y - x * z), -2 * (w * x + y * z), 2 * (x * x + y * y) - 1], dim=-1)
+
+
+def pitched(vectors: Tensor, pitch: Tensor) -> Tensor:
+    """``vectors`` (N, 3) in a base that is pitched forwards by ``pitch`` (N, 1) rad, in a level one."""
+    sin, cos, (x, y, z) = torch.sin(pitch), torch.cos(pitch), vectors.split(1, dim=-1)
+    return torch.cat([cos * x + sin * z, y, cos * z - sin * x], dim=-1)
 
 
 def _circle(phase: Tensor) -> Tensor:

@@ -46,3 +46,40 @@ def standing_height(model: mujoco.MjModel, joint_pos: np.ndarray) -> np.ndarray:
         mujoco.mj_kinematics(model, data)
         heights[k] = -(data.geom_xpos[feet, 2] - model.geom_size[feet, 0]).min()
     return heights
+
+
+class Stature:
+    """How high the base of a robot is whose soles are flat on the floor, and how far it is pitched, by its leg joints."""
+
+    JOINTS = ("hip_pitch", "knee", "ankle_pitch")
+
+    def __init__(self, model: mujoco.MjModel, home: np.ndarray) -> None:
+        """``home`` (n,) rad: a pose with flat soles and a level base. Of a chain in a plane, height is linear in the sines
+        and cosines of its links' angles, and that is fitted here."""
+        self._legs = np.array([[model.jnt_qposadr[model.joint(f"{side}_{j}_joint").id] - 7 for j in self.JOINTS]
+                               for side in ("left", "right")])  # fmt: skip
+        self._level = home[self._legs].sum(axis=1).mean()
+        angles = np.random.default_rng(0).uniform((-2.0, 0.0, -0.8), (0.0, 2.4, 0.0), (50, 3))
+        poses = np.tile(home, (len(angles), 1))
+        poses[:, self._legs] = angles[:, None]
+        data, heights = mujoco.MjData(model), []
+        feet = [g for g in range(model.ngeom) if "_foot_" in model.geom(g).name]
+        for pose, pitch in zip(poses, self.pitch(poses), strict=True):
+            data.qpos[:] = [0, 0, 0, np.cos(pitch / 2), 0, np.sin(pitch / 2), 0, *pose]
+            mujoco.mj_kinematics(model, data)
+            heights.append(-(data.geom_xpos[feet, 2] - model.geom_size[feet, 0]).min())
+        self._share = np.linalg.lstsq(self._parts(poses), np.array(heights), rcond=None)[0]
+
+    def pitch(self, pose: np.ndarray) -> np.ndarray:
+        """(k,) rad forwards for poses (k, n)."""
+        return self._level - pose[:, self._legs].sum(axis=2).mean(axis=1)
+
+    def height(self, pose: np.ndarray) -> np.ndarray:
+        """(k,) m for poses (k, n)."""
+        return self._parts(pose) @ self._share
+
+    def _parts(self, pose: np.ndarray) -> np.ndarray:
+        hip, knee, _ = pose[:, self._legs].mean(axis=1).T
+        pitch = self.pitch(pose)
+        angles = np.stack([pitch, pitch + hip, pitch + hip + knee], axis=1)
+        return np.concatenate([np.cos(angles), np.sin(angles), np.ones((len(pose), 1))], axis=1)

@@ -6,13 +6,14 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.modules import MLP
 from torch import nn
 
 from policies import training
-from policies.basics import Basics
+from policies.basics import TASKS, Basics
 from policies.env import Env
 from policies.evaluate import quick_survival
 from policies.gait import Stride
@@ -22,7 +23,7 @@ from sim2real.types import Sim2realError
 
 
 class Training(training.Training):
-    """The basics: one observation for actor and critic (the exported critic sees what the actor sees), both symmetric."""
+    """Basics: one observation for actor and critic (the exported critic sees what the actor sees), both symmetric."""
 
     def make(self, seed: int) -> tuple[Env, PPO]:
         env = Env(self.config, seed)
@@ -35,7 +36,13 @@ class Training(training.Training):
 
     def evaluate(self) -> dict[str, float]:
         row = quick_survival(self.config, self.graph())
-        return row | {"score": (row["survival"] + row["survival_pushed"]) / 2}
+        shares = [share for name, share in row.items() if name.startswith("survival")]
+        return row | {"score": sum(shares) / len(shares)}
+
+    def start_from(self, checkpoint: Path) -> None:
+        super().start_from(checkpoint)
+        with torch.no_grad():
+            self.ppo.actor.distribution.std_param.clamp_(min=self.config.std_again)
 
 
 class MirroredModel(MLPModel):
@@ -89,10 +96,11 @@ def load_config(folder: Path) -> Basics:
 
 def tasks() -> dict[str, tuple[Any, Any, Any]]:
     """Every task by name: its settings, its kind of training, and what reads such settings back."""
-    from policies.skillmimic.config import TASKS
+    from policies.skillmimic import config
     from policies.skillmimic.train import SkillTraining, skills
 
-    return {"g1-basics": (Basics(), Training, basics)} | {n: (c, SkillTraining, skills) for n, c in TASKS.items()}
+    ball = {name: (c, SkillTraining, skills) for name, c in config.TASKS.items()}
+    return {name: (c, Training, basics) for name, c in TASKS.items()} | ball
 
 
 def train_command(task: str, folder: Path, start: Path | None = None, **settings: Any) -> None:

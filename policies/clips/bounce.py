@@ -19,17 +19,16 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, Self
 
 import mink
-import mujoco
 import numpy as np
 
 from policies import ball
 from policies.clips.format import Clip, Header
 from policies.clips.kinematics import smooth
+from policies.clips.reach import Frame, follow, points
 from policies.clips.robot import POINT_NAMES, SIDES, RobotBody
 from policies.physics import standing_height
 
 GRAVITY = 9.81  # m/s^2
-SOLVER = "daqp"
 CLEAR = 0.015  # m between palm and ball while they do not touch
 SMOOTHING = 0.5  # frames
 TICK = 0.02  # s of a policy: a bounce lasts some of them
@@ -175,13 +174,13 @@ class Drop:
         away = (f > 0) & (left > 1e-9)  # in the first frame hands have the ball, whatever rounding says
         u, lift = np.clip(-left / self.lift, 0, 1), flight.top - flight.peak
         z, v = flight.at(np.minimum(t, flight.period))
-        z, v = z + lift * _eased(u), v + lift / self.lift * 30 * u**2 * (1 - u) ** 2
-        palm = flight.palms(t, self.follow, self.closing, _eased)
-        apart = self.open * _eased(f / self.opening) * _eased(left / self.closing)
+        z, v = z + lift * eased(u), v + lift / self.lift * 30 * u**2 * (1 - u) ** 2
+        palm = flight.palms(t, self.follow, self.closing, eased)
+        apart = self.open * eased(f / self.opening) * eased(left / self.closing)
         return Path(z, v, np.where(away, palm, z), np.where(away, apart, 0.0), ~away)
 
 
-def _eased(u: np.ndarray) -> np.ndarray:
+def eased(u: np.ndarray) -> np.ndarray:
     """From 0 to 1 with the least jerk (T. Flash and N. Hogan, J. Neuroscience 5, 1985)."""
     u = np.clip(u, 0, 1)
     return u**3 * (10 - 15 * u + 6 * u**2)
@@ -217,48 +216,26 @@ def _clip(
     ``turned`` m/rad: what a hand turned otherwise counts beside one that is elsewhere.
     """
     radius = ball.RADIUS
-    frames = round(round(motion.period(radius) / TICK) * TICK * fps)
-    motion = motion.lasting(radius, frames / fps)
-    path = motion.path(radius, np.arange(frames * (SETTLING + 2)) / fps)
-    names, model = body.robot.joint_names, body.model
+    count = round(round(motion.period(radius) / TICK) * TICK * fps)
+    motion = motion.lasting(radius, count / fps)
+    path = motion.path(radius, np.arange(count * (SETTLING + 2)) / fps)
+    names = body.robot.joint_names
     pose = body.robot.home_pos.copy()
     for joint, angle in (("hip_pitch", -KNEES / 2), ("knee", KNEES), ("ankle_pitch", -KNEES / 2)):
         pose[[names.index(f"{s}_{joint}_joint") for s in SIDES]] = angle
-    height = float(standing_height(model, pose[None])[0])
+    height = float(standing_height(body.model, pose[None])[0])
     touch = body.palm_height(radius)
 
-    data = mujoco.MjData(model)
-    configuration = mink.Configuration(model)
-    q = model.qpos0.copy()
-    q[:3], q[3:7] = [0, 0, height], [1, 0, 0, 0]
-    q[body.qpos_at] = pose
-    configuration.update(q)
-    mine = np.array([j.group == "arm" and any(s in j.name for s in facing) for j in body.robot.joints])
-    still = np.ones(model.nv, bool)
-    still[body.qvel_at[mine]] = False
-    reach = [mink.FrameTask(f"{s}_palm", "site", 1.0, turned) for s in facing]
-    posture = mink.PostureTask(model, 3e-2)
-    posture.set_target(q)
-    freeze = mink.DofFreezingTask(model, np.flatnonzero(still).tolist())
-    limits = [mink.ConfigurationLimit(model)]
-    rows = []
+    base = np.array([0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0])
+    frames = []
     for palm, apart in zip(path.palm, path.apart, strict=True):
-        for task, turn in zip(reach, facing.values(), strict=True):
-            there = np.array([*place, palm]) - turn.apply(np.array([0.0, 0.0, touch + apart]))
-            task.set_target(mink.SE3.from_rotation_and_translation(turn, there))
-        for _ in range(12):
-            speed = mink.solve_ik(
-                configuration, [*reach, posture], 0.1, SOLVER, damping=1e-3, limits=limits, constraints=[freeze]
-            )
-            configuration.integrate_inplace(speed, 0.1)
-        rows.append(configuration.q[body.qpos_at].copy())
-    last = slice(frames * SETTLING, frames * (SETTLING + 1))
-    joint_pos = smooth(np.array(rows), SMOOTHING)[last]
-    points = np.zeros((frames, len(POINT_NAMES), 3))
-    for k, joints in enumerate(joint_pos):
-        data.qpos[:3], data.qpos[3:7], data.qpos[body.qpos_at] = [0, 0, height], [1, 0, 0, 0], joints
-        mujoco.mj_kinematics(model, data)
-        points[k] = body.points(data)
+        over = touch + apart
+        there = {s: np.array([*place, palm]) - turn.apply(np.array([0.0, 0.0, over])) for s, turn in facing.items()}
+        palms = {s: mink.SE3.from_rotation_and_translation(facing[s], x) for s, x in there.items()}
+        frames.append(Frame(base, pose, palms))
+    last = slice(count * SETTLING, count * (SETTLING + 1))
+    joint_pos = smooth(follow(body, frames, turned), SMOOTHING)[last]
+    base = np.tile(base, (count, 1))
     hands = path.on[last, None] & np.array([s in facing for s in SIDES])
     header = Header(
         name=name, skill=name.rsplit("_", 1)[0], body=body.robot.name, fps=fps, joint_names=names,
@@ -266,11 +243,11 @@ def _clip(
     )  # fmt: skip
     return Clip(
         header,
-        base_position_in_world=np.tile([0.0, 0.0, height], (frames, 1)),
-        base_orientation_in_world=np.tile([1.0, 0, 0, 0], (frames, 1)),
+        base_position_in_world=base[:, :3],
+        base_orientation_in_world=base[:, 3:],
         joint_pos=joint_pos,
-        points_in_world=points,
-        ball_position_in_world=np.column_stack([np.tile(place, (frames, 1)), path.ball[last]]),
-        ball_velocity_in_world=np.column_stack([np.zeros((frames, 2)), path.velocity[last]]),
-        contact=np.column_stack([hands, np.ones((frames, 2), bool)]),
+        points_in_world=points(body, base, joint_pos),
+        ball_position_in_world=np.column_stack([np.tile(place, (count, 1)), path.ball[last]]),
+        ball_velocity_in_world=np.column_stack([np.zeros((count, 2)), path.velocity[last]]),
+        contact=np.column_stack([hands, np.ones((count, 2), bool)]),
     )

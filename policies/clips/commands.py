@@ -116,7 +116,7 @@ def retarget_clips(
         if place:
             place.mkdir(parents=True, exist_ok=True)
     rows: dict[str, Residuals] = {}
-    for robot in _bounces(body) if from_library else ():
+    for robot in _by_formula(body) if from_library else ():
         save_clip(robot, folder / f"{robot.name}.npz")
         rows[robot.name] = feasibility.residuals(robot, body)
     for human in track(clips, "retargeting", transient=True):
@@ -147,14 +147,17 @@ def _to_retarget(
             yield mirror(clip)
 
 
-def _bounces(body: RobotBody) -> Iterator[Clip]:
-    """What the library of a robot has made by formula."""
+def _by_formula(body: RobotBody) -> Iterator[Clip]:
+    """What the library of a robot has made by formula, numbered after its pieces of recordings."""
     from policies.clips.bounce import bounce, dribble
+    from policies.clips.pickup import pickup
 
-    for skill, hands in library.robot_library(body.robot).bounces.items():
-        for number, hand in enumerate(hands, 1):
+    chosen = library.robot_library(body.robot)
+    for skill, ways in chosen.formulas.items():
+        for number, way in enumerate(ways, 1 + len(chosen.skills.get(skill, ()))):
             name = f"{skill}_{number:02d}"
-            yield bounce(body, name) if hand == "both" else dribble(body, name, hand)
+            made = {"both": bounce, "floor": pickup}
+            yield made[way](body, name) if way in made else dribble(body, name, way)
 
 
 def _library_folder(robot: str) -> Path:

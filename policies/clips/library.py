@@ -34,7 +34,8 @@ class Library(Strict):
     """Every piece that a robot's skills are trained on."""
 
     skills: dict[str, list[Piece]]
-    bounces: dict[str, list[Literal["left", "right", "both"]]] = {}  # made by formula (bounce.py), by these hands
+    # made by formula: bounces (bounce.py) by these hands, and pickups from the floor (pickup.py)
+    formulas: dict[str, list[Literal["left", "right", "both", "floor"]]] = {}
 
 
 def library_path(robot: str) -> Path:

@@ -18,7 +18,7 @@ from policies.contact_graph import ContactGraph, reference_edges
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.plan import GRAVITY, TIPS, Rows
 from policies.skillmimic.rewards import Motion
-from policies.skillmimic.stance import crouched, stand, trunk
+from policies.skillmimic.stance import crouched, stand, trunks
 
 SINGULAR = 0.08  # m/rad: damps the way back from palms to joints where an arm is stretched
 LATE = 0.02  # s, on average, until a target acts: it is held for a tick, and travels
@@ -39,7 +39,8 @@ class ReferenceClips:
 
     ``first`` and ``length`` (clips,): rows of each; ``skill`` (clips,) its label's index; ``swing`` (clips,) whether it
     plays to and fro, ``loop`` whether over and over. ``qpos`` (rows, 7 + n + 7), ``qvel`` (rows, 6 + n + 6) and ``target``
-    (rows, n) start an episode.
+    (rows, n) start an episode. How a base policy stands: ``stance`` (rows, n) rad, which has the trunk at
+    ``trunk_position`` (rows, 3) m and ``trunk_orientation`` (rows, 4).
     """
 
     def __init__(
@@ -62,20 +63,13 @@ class ReferenceClips:
             labels += [k] * len(found)
         for clip in clips:
             _check(clip, body)
-        # How the base stands in each skill: joints (skills, n) rad, and where that has the trunk.
-        self.stances = np.tile(body.robot.home_pos, (len(config.skills), 1))
-        self.trunk_position, self.trunk_orientation = (
-            np.zeros((len(config.skills), 3)),
-            np.zeros((len(config.skills), 4)),
-        )
         if crouch is not None:
-            for k in range(len(config.skills)):
-                mine = [i for i, label in enumerate(labels) if label == k]
-                height = float(np.mean([clips[i].base_position_in_world[:, 2].mean() for i in mine]))
-                self.stances[k], height = crouched(body, body.robot.home_pos, crouch, height)
-                self.trunk_position[k], self.trunk_orientation[k] = trunk(body, self.stances[k], height)
+            for k, skill in enumerate(config.skills):
+                mine = [i for i, label in enumerate(labels) if label == k and skill not in config.bends]
+                heights = [clips[i].base_position_in_world[:, 2].mean() for i in mine]
+                stance, height = crouched(body, body.robot.home_pos, crouch, float(np.mean(heights or [0.0])))
                 for i in mine:
-                    clips[i] = stand(clips[i], body, self.stances[k], height)
+                    clips[i] = stand(clips[i], body, stance, height)
         fine = [resample(clip, 1 / config.timestep) for clip in clips]
         self.hands = np.array([c.contact[:, :2].any(axis=0) for c in clips])  # (clips, 2): which ever touch the ball
         self._config, self._model, self._body = config, model, body
@@ -85,6 +79,10 @@ class ReferenceClips:
         self.skill = np.array(labels)
         self.swing, self.loop = (np.array([config.skills[k] in c for k in labels]) for c in (config.swing, config.loop))
         sides = tuple(model.geom(int(geoms[0])).name for geoms in body.hand_geoms)
+        legs = np.array([j.group != "arm" for j in body.robot.joints])
+        self.stance = np.where(legs, np.concatenate([c.joint_pos for c in fine]), body.robot.home_pos)
+        places = [trunks(body, c) for c in fine]
+        self.trunk_position, self.trunk_orientation = (np.concatenate(x) for x in zip(*places, strict=True))
         self._motion = _concatenate([_motion(c, graph, sides) for c in fine])
         rows = [_resampled(grip(c, model, body, kp, config.grip), len(f)) for c, f in zip(clips, fine, strict=True)]
         press, effort = (np.concatenate([r[i] for r in rows]) for i in (0, 1))
@@ -134,6 +132,14 @@ class ReferenceClips:
             object_velocity=m.object_velocity * way[:, None],
         )
 
+    def seconds(self, clip: int) -> float:
+        """How long clip number ``clip`` lasts."""
+        return float((self.length[clip] - 1) * self._config.timestep)
+
+    def start(self) -> np.ndarray:
+        """(n,) rad, targets of a robot that is about to begin with the first skill: the mean of one that plays to and fro."""
+        return self.mean(0)[0] if self.swing[0] else self.target[0]
+
     def plan(self, skill: int, acting: Sequence[int], pull: float) -> Rows:
         """What the arms, joints ``acting`` by index, do in a skill by its first clip; one row for a clip that plays to and
         fro. ``pull``: see ``plan.Rows``; a ball in the hands has no say in the time."""
@@ -145,7 +151,8 @@ class ReferenceClips:
         ball_in_base = rotate(turn, m.object_position[at] - m.points[at, 0])
         velocity = rotate(turn, m.object_velocity[at] - m.points_velocity[at, 0])
         target = (self.target[at] + self._lag * m.joint_vel[at])[:, acting]
-        pulls = pull * (m.contact[at, 0] == 0)
+        flies = (m.contact[at, 0] == 0) & m.object_velocity[at].any(axis=1)  # a ball that lies says nothing of the time
+        pulls = pull * flies
         if self.loop[
             clip
         ]:  # a stroke once begun is finished, whatever the ball makes of it; its return says when the next is
@@ -153,6 +160,7 @@ class ReferenceClips:
         if self.swing[clip]:
             target, ball_in_base = self.mean(skill)[0][None, acting], ball_in_base.mean(axis=0, keepdims=True)
             velocity, pulls = np.zeros((1, 3)), np.zeros(1)
+        pose = self.stance[at[: len(target)]] - self._body.robot.home_pos
         data, back = mujoco.MjData(self._model), np.zeros((len(target), len(acting), TIPS.stop))
         for t in range(len(target)):
             if gone[t]:
@@ -169,7 +177,10 @@ class ReferenceClips:
         if self.loop[clip] and self.hands[clip].all():
             share = _followed(m.contact[at, 0] > 0, velocity[:, 2] > 0, YIELD / self._config.period)
             back *= share[:, None, None]
-        return Rows(target, ball_in_base, velocity, back, bool(self.loop[clip]), pulls)
+        loop = bool(self.loop[clip])
+        ready = loop or not (m.contact[at[0], 0] or pulls[0])
+        away = (m.contact[at[: len(target)], 0] == 0) & loop & self.hands[clip].all()
+        return Rows(target, pose, ball_in_base, velocity, back, loop, ready, away, pulls)
 
     def _gone(self, clip: int, at: np.ndarray) -> np.ndarray:
         """(rows,) bool: whether the ball has left the hands for good."""

@@ -27,9 +27,10 @@ class SkillMimic:
     # the actor moves every joint, as in the paper.
     base: str | None = None
     corrections: str | None = None  # of the plan of the arms (plan.py), a file; only with a base
-    # skills in which the ball, and not the clock, says how far on
-    timed: tuple[str, ...] = ("catch", "dribble_in_place", "bounce")
+    # skills in which the clip waits: for the ball, or for arms to be where it begins
+    timed: tuple[str, ...] = ("catch", "dribble_in_place", "bounce", "pickup")
     walks: tuple[str, ...] = ()  # skills during which the base obeys velocity commands
+    bends: tuple[str, ...] = ("pickup",)  # skills in which the base bends legs and waist as the clip does
     still: float = 0.3  # share of their episodes without any
     # the policy
     period: float = (
@@ -51,6 +52,7 @@ class SkillMimic:
     disturbed: float = 0.5  # share of episodes that start beside their reference frame
     # m/s, the most by which a ball that flies at the start does so otherwise than in the clip, each way
     throw: float = 0.1
+    placed: float = 0.05  # m, the most by which a ball that lies there does so elsewhere, each way
     push_chance: float = 0.01  # a tick
     push_speed: float = 0.3  # m/s, the largest
     terminations: tuple[str, ...] = ("fallen", "tilted", "ball_lost", "broken")
@@ -80,7 +82,7 @@ class SkillMimic:
     evaluate_seconds: float = 6.0
 
 
-BASE = "policies/g1/basics.pt"
+BASE, DOWN, PLAN = "policies/g1/basics.pt", "policies/g1/down.pt", "policies/g1/plan.yaml"
 BALL = {  # a clip each: the calmest, and those that come from and go to the front
     "hold": "hold_01",
     "carry": "carry_01",
@@ -90,7 +92,7 @@ BALL = {  # a clip each: the calmest, and those that come from and go to the fro
     "bounce": "bounce_01",
 }
 TASKS: dict[str, SkillMimic] = {
-    "g1-ball": SkillMimic(base=BASE, corrections="policies/g1/plan.yaml", skills=tuple(BALL), clips=tuple(BALL.values()),
+    "g1-ball": SkillMimic(base=BASE, corrections=PLAN, skills=tuple(BALL), clips=tuple(BALL.values()),
                           walks=("carry",), frames=150),
-    "g1-pickup": SkillMimic(clips=(), skills=("pickup",), balance_gain=0.0, balance_damping=0.0, samples=100e6),
+    "g1-pickup": SkillMimic(base=DOWN, corrections=PLAN, skills=("pickup",), clips=("pickup_09",), frames=400),
 }  # fmt: skip

@@ -28,7 +28,7 @@ from policies.skillmimic.randomisation import Randomisation
 from policies.skillmimic.rewards import SENSITIVITIES, Motion, Step, reward
 from policies.skillmimic.sight import Sight
 from policies.skillmimic.stance import arms, moved
-from policies.skillmimic.starts import thrown
+from policies.skillmimic.starts import object_start, thrown
 from policies.skillmimic.terminations import failed, up
 from sim2real.object.scene import AIMING
 from sim2real.types import Sim2realError
@@ -68,6 +68,7 @@ class Env(VecEnv):
         timed = np.array([name in config.timed for name in config.skills])
         self._timed = timed[self.clips.skill]  # whose clock is the plan's
         self._ends = ~(self.clips.swing | self.clips.loop)
+        self._lies = np.array([object_start(self.graph, k)["how"] == "placed" for k in range(len(self.clips.names))])
         self._throws = {k: t for k in range(len(self.clips.names)) if (t := thrown(self.graph, k))}
         self._qpos, self._qvel = self.batch.bind("qpos"), self.batch.bind("qvel")
         self._anchors, self._sites = self.batch.bind("xanchor"), self.batch.bind("site_xpos")
@@ -209,16 +210,18 @@ class Env(VecEnv):
             object_velocity=qvel[:, FLIGHT],
             contact=touched.astype(float),
         )
-        reference = self.reference(*self.clips.rows(self.clip, np.maximum(self.row - 1, 0)))
+        rows, way = self.clips.rows(self.clip, np.maximum(self.row - 1, 0))
+        reference = self.clips.motion(rows, way)
+        upright = [up(m.orientation_base_in_world) for m in (state, reference)]
+        height = [m.points[:, 0, 2] for m in (state, reference)]
         acceleration = (state.joint_vel - self._last_joint_vel) / self.config.period
         self._last_points, self._last_joint_vel = points, state.joint_vel.copy()
         gone = self._ends[self.clip] & (self.row >= self.clips.length[self.clip]) & (reference.contact[:, 0] == 0)
-        self.apart = np.linalg.norm(qpos[:, BALL] - qpos[:, :3], axis=1)
-        upright = up(qpos[:, 3:7]), up(reference.orientation_base_in_world)
+        self.apart, self.lifted = np.linalg.norm(qpos[:, BALL] - qpos[:, :3], axis=1), qpos[:, -5].copy()
         if self.graph.base is not None:
-            trunk, stance = (self._bodies[:, self._trunk], self._turns[:, self._trunk]), self.clips.skill[self.clip]
-            there = self.clips.trunk_position[stance], self.clips.trunk_orientation[stance]
-            state = arms(moved(state, qvel, trunk, there), self.graph.acting)
+            trunk = self._bodies[:, self._trunk], self._turns[:, self._trunk]
+            there = self.clips.trunk_position[rows], self.clips.trunk_orientation[rows]
+            state, reference = (arms(m, self.graph.acting) for m in (moved(state, qvel, trunk, there), reference))
             acceleration = acceleration[:, self.graph.acting]
         away = lambda there, here: np.where(gone[:, None], here, there)  # noqa: E731
         reference = reference._replace(
@@ -226,7 +229,7 @@ class Env(VecEnv):
             object_velocity=away(reference.object_velocity, state.object_velocity),
         )
         bounces = self.clips.loop[self.clip]
-        return Step(state, reference, acceleration, action_change, qpos[:, 2], *upright, bounces)
+        return Step(state, reference, acceleration, action_change, *height, *upright, bounces)
 
     def reference(self, rows: np.ndarray, way: np.ndarray) -> Motion:
         """What is imitated at table ``rows`` (N,), as ``_judge`` sees states."""
@@ -332,7 +335,10 @@ class Env(VecEnv):
         qpos, qvel, target = self.clips.qpos[rows].copy(), self.clips.qvel[rows].copy(), self.clips.target[rows].copy()
         swollen = ball.RADIUS * (self.random.drawn["ball_radius"][ids] - 1)  # m; hands lie on the ball that there is
         qpos[:, JOINTS] -= self.clips.press[rows] * swollen
-        flies = self.clips.motion(rows, np.ones(k)).contact[:, :1] == 0
+        if (lies := self._lies[self.clip[ids]] & (self.row[ids] == 0)).any():
+            qpos[:, -7:-5] += lies[:, None] * rng.uniform(-self.config.placed, self.config.placed, (k, 2))
+            qpos[:, -5] += lies * swollen[:, 0]
+        flies = (self.clips.motion(rows, np.ones(k)).contact[:, :1] == 0) & ~self._lies[self.clip[ids], None]
         self._miss[ids] = flies * rng.uniform(-self.config.throw, self.config.throw, (k, 3))
         qvel[:, FLIGHT] += self._miss[ids]
         if waits.any():  # the ball is in other hands, and the arms come from somewhere between here and home
@@ -358,7 +364,7 @@ class Env(VecEnv):
             self.carries["carry_arms"][ids] = self.target[ids][:, self.graph.acting]
             # whose arms are where they are sent
             self.carries["carry_base_posture"][ids] = torch.where(
-                self.graph.acts > 0, self.target[ids], _tensor(self.clips.stances[self.clips.skill[self.clip[ids]]])
+                self.graph.acts > 0, self.target[ids], _tensor(self.clips.stance[rows])
             )
             low, high = self.graph.base.config.command_low, self.graph.base.config.command_high
             some = rng.random((k, 1)) > self.config.still

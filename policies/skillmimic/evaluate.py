@@ -46,6 +46,7 @@ class Trace(NamedTuple):
     held: np.ndarray  # (T,) bool: hands touch the ball
     ball_velocity: np.ndarray  # (T, 3) m/s
     apart: np.ndarray  # (T,) m between ball and base
+    lifted: np.ndarray  # (T,) m of the ball's centre above the floor
     height: np.ndarray  # (T,) m of the base
     up: np.ndarray  # (T,) bool: nothing failed up to here
 
@@ -77,6 +78,11 @@ def _caught(t: Trace, period: float, ticks: int) -> float:
     return float(t.up[-1] and t.held[-round(HELD / period) :].all())
 
 
+def _picked(t: Trace, period: float, ticks: int) -> float:
+    """Section 6.2, at the robot's size: at the end the ball is more than 1 m above the floor; and the robot stands."""
+    return float(t.up[-1] and t.lifted[-1] > 1.0 * LENGTH)
+
+
 def _dribbled(t: Trace, period: float, ticks: int) -> float:
     """Section 6.2: the share of frames with base above 0.5 m and ball nearer than 1.5 m, at the robot's size; frames after
     a failure do not count, nor those more than 2 s after the last touch."""
@@ -104,6 +110,7 @@ RULES: dict[str, Callable[[Trace, float, int], float]] = {
     "dribble_in_place": _dribbled,
     "dribble_forward": _dribbled,
     "bounce": _bounced,
+    "pickup": _picked,
 }
 """Success in [0, 1] of an episode of ``ticks``, had nothing failed, by skill; of every other skill: ``_kept``."""
 
@@ -221,4 +228,4 @@ def episodes_of(graph: PolicyGraph, skill: str, episodes: int, seconds: float, p
 def traced(env: Env, up: np.ndarray) -> Trace:
     """This tick of every robot; ``up`` (envs,) bool: nothing failed so far."""
     state = env.now.state
-    return Trace(state.contact[:, 0] > 0, state.object_velocity, env.apart, env.now.height, up)
+    return Trace(state.contact[:, 0] > 0, state.object_velocity, env.apart, env.lifted, env.now.height, up)

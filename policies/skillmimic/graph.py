@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 import policies.graph
 from policies.clips.robot import RobotBody
+from policies.gait import Gait
 from policies.observations import gravity_in_base
 from policies.observations import observe as observe_base
 from policies.skillmimic.clips import ReferenceClips
@@ -39,7 +40,6 @@ class PolicyGraph(nn.Module):
     ankles: Tensor
     drive: Tensor
     acts: Tensor
-    poses: Tensor
     walks: Tensor
     gaits: Tensor
     spread: Tensor
@@ -80,7 +80,6 @@ class PolicyGraph(nn.Module):
             labels = list(self.base.labels)
             self.register_buffer("gaits", torch.eye(len(labels))[[labels.index("walk"), labels.index("stand")]])
             self.register_buffer("spread", _buffer(np.eye(len(acts))[self.acting]))  # arms to joints
-        self.register_buffer("poses", _buffer(self.clips.stances - robot.home_pos))  # (skills, n), of the base
         self.register_buffer("walks", _buffer(np.array([[skill in config.walks] for skill in config.skills])))
         self.register_buffer("lower", _buffer(robot.position_min + config.position_margin))
         self.register_buffer("upper", _buffer(robot.position_max - config.position_margin))
@@ -116,7 +115,7 @@ class PolicyGraph(nn.Module):
 
     def carry_start(self) -> dict[str, list[float]]:
         """What each carried tensor is before the first tick; an empty list is zeros."""
-        start = torch.where(self.acts > 0, self.postures[0], _buffer(self.clips.stances[0]))
+        start = torch.where(self.acts > 0, _buffer(self.clips.start()), _buffer(self.clips.stance[0]))
         known = {"carry_base_posture": start.tolist(), "carry_arms": start[self.acting].tolist()}
         return {n: known.get(n, []) for n in self.inputs() if n.startswith("carry_")}
 
@@ -161,6 +160,9 @@ class PolicyGraph(nn.Module):
             inputs[n] for n in ("orientation_base_in_world", "angular_velocity_base_in_base", "skill")
         )
         ball = torch.cat([inputs["object_position_in_base"], inputs["object_velocity_in_base"]], dim=-1)
+        if self.base is not None:
+            last = inputs["carry_skill"]
+            skill = self.plan.performed(skill, last, inputs["carry_clock"], ball)
         posture, gravity, carried = skill @ self.postures, gravity_in_base(orientation), {}
         if self.base is None:
             planned = torch.zeros(len(skill), 7)
@@ -168,12 +170,13 @@ class PolicyGraph(nn.Module):
             ankle = config.balance_gain * (gravity[:, 0:1] - skill @ self.lean) + config.balance_damping * gyro[:, 1:2]
             rest = posture + self.ankles * ankle
         else:
-            plan = self.plan(skill, inputs["carry_skill"], inputs["carry_clock"], inputs["carry_arms"], ball)
+            calm = Gait.resting(inputs["carry_base_gait"])
+            plan = self.plan(skill, last, inputs["carry_clock"], inputs["carry_arms"], ball, calm)
             planned = torch.cat([plan.ball_error, plan.clock / self.plan.longest], dim=-1)
             posture = plan.target @ self.spread
             # The base sees the arms on their way to where they were last sent.
             hands = self.acts * (posture - self.base.home + inputs["carry_action"] @ self.drive)
-            pose = skill @ self.poses * (1 - self.acts) + hands
+            pose = plan.pose * (1 - self.acts) + hands
             command = inputs["command_velocity"] * (skill @ self.walks)
             given = {n.replace("carry_base", "carry"): v for n, v in inputs.items() if n.startswith("carry_base_")}
             seen = self.base.advance(*joints, orientation, gyro, command, self.gait(command), **given, pose=pose)

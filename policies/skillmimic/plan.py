@@ -26,6 +26,7 @@ KNOTS = 8  # of a skill that moves
 # The furthest that palms follow the ball: m forwards, left, up; rad tipped forwards, left.
 REACH = np.array([0.15, 0.15, 0.25, 0.5, 0.5])
 TIPS = slice(3, 5)  # of these
+LOST = 0.4  # m from its plan: a ball farther away does not come back
 SLOW = 0.5  # m/s: a ball slower than this says little about the time
 # rad a tick: how fast targets go to where a skill begins. Arms that are thrown there throw the robot off its feet.
 APPROACH, AT_ONCE = 0.04, 10.0
@@ -46,11 +47,14 @@ class Rows:
     """One skill's targets, a row a policy period."""
 
     target: np.ndarray  # (T, arms) rad
+    pose: np.ndarray  # (T, n) rad from home, how a base stands
     ball: np.ndarray  # (T, 3) m in the base
     velocity: np.ndarray  # (T, 3) m/s
     # rad of the arms whose palms have business with the ball, per m that they move, and per rad that they tip
     back: np.ndarray  # (T, arms, 5)
     loop: bool
+    ready: bool  # it begins when the arms are there: neither a ball in the hands nor one in the air brings them
+    away: np.ndarray  # (T,) bool: the ball comes back to both hands, and until then nothing else can begin
     pull: np.ndarray  # (T,) rows a tick per s that the ball is ahead, of a clock that follows it; 0: it runs by itself
     knots: np.ndarray = field(init=False)  # (T, KNOTS) shares of the knots in each row
 
@@ -67,6 +71,7 @@ class Planned(NamedTuple):
     """This tick of every robot."""
 
     target: Tensor  # (N, arms) rad
+    pose: Tensor  # (N, n) rad from home, of the base
     clock: Tensor  # (N, 1) rows since the skill's beginning; negative while arms are on their way to it
     ball_error: Tensor  # (N, 6) m and m/s from where the plan has the ball
 
@@ -81,6 +86,9 @@ class Plan(nn.Module):
     first: Tensor
     last: Tensor
     loop: Tensor
+    ready: Tensor
+    away: Tensor
+    poses: Tensor
     bounce: Tensor
     offsets: Tensor
     follow: Tensor
@@ -105,6 +113,9 @@ class Plan(nn.Module):
         jumps = [max(np.ptp(r.velocity[:, 2]) / GRAVITY, 0.1) if r.loop else 1.0 for r in rows]
         self.register_buffer("bounce", _buffer(np.array(jumps)[:, None]))
         self.register_buffer("loop", _buffer([[r.loop] for r in rows]))
+        self.register_buffer("ready", _buffer([[r.ready] for r in rows]))
+        self.register_buffer("away", _buffer(np.concatenate([r.away for r in rows])[:, None]))
+        self.register_buffer("poses", _buffer(np.concatenate([r.pose for r in rows])))
         self.register_buffer("offsets", _buffer(np.stack([c.offsets for c in corrections])))
         self.register_buffer("follow", _buffer(np.stack([np.concatenate([c.follow, c.damp]) for c in corrections])))
         self.register_buffer("reach", _buffer(REACH))
@@ -114,14 +125,30 @@ class Plan(nn.Module):
         offsets = skill @ self.offsets.flatten(1)  # a matrix product: the runtime knows no einsum
         return offsets.unflatten(1, self.offsets.shape[1:]), skill @ self.follow
 
+    def performed(self, skill: Tensor, last_skill: Tensor, last_clock: Tensor, ball: Tensor) -> Tensor:
+        """The skill (N, labels) of this tick where ``skill`` is asked for: one whose ball is in the air goes on until that is
+        back, unless it is lost."""
+        row = (last_skill @ self.first + torch.clamp(torch.floor(last_clock), min=0.0))[:, 0].to(torch.int64)
+        off = ball[:, :3] - self.table[row][:, self.arms : self.arms + 3]
+        near = (off * off).sum(dim=-1, keepdim=True) < LOST**2
+        stays = last_skill.sum(dim=-1, keepdim=True) * self.away[row] * near.to(ball.dtype)
+        return stays * last_skill + (1 - stays) * skill
+
     def forward(
-        self, skill: Tensor, last_skill: Tensor, last_clock: Tensor, last_target: Tensor, ball: Tensor
+        self,
+        skill: Tensor,
+        last_skill: Tensor,
+        last_clock: Tensor,
+        last_target: Tensor,
+        ball: Tensor,
+        calm: Tensor,
     ) -> Planned:
         """``skill`` (N, labels) one-hot, and that of the tick before with its clock (N, 1) and targets (N, arms); ``ball``
-        (N, 6) m and m/s in the base."""
+        (N, 6) m and m/s in the base; ``calm`` (N, 1) bool: the feet rest, without which no ball is let go that is to come
+        back."""
         same = (skill * last_skill).sum(dim=-1, keepdim=True)
-        last, loop = skill @ self.last, skill @ self.loop
-        clock, rate = self._step(skill, same * last_clock, same, last, loop, ball)
+        last, loop, ready = skill @ self.last, skill @ self.loop, skill @ self.ready
+        clock, rate = self._step(skill, same * last_clock, same, last, loop, ball, calm)
         here = torch.clamp(torch.floor(clock), min=0.0)
         share = torch.clamp(clock, min=0.0) - here
         row = (skill @ self.first + here)[:, 0].to(torch.int64)
@@ -138,13 +165,13 @@ class Plan(nn.Module):
         target = planned[:, : self.arms] + (mixed(self.knots)[:, :, None] * offsets).sum(dim=1)
         target = target + (self.back[row] * wanted[:, None]).sum(dim=-1)
         far = (target - last_target).abs().amax(dim=-1, keepdim=True)
-        clock = torch.where((same == 0) & (loop > 0), -far / APPROACH, clock)  # a ball in the hands comes along
-        step = torch.where((clock < 0) | ((clock < 1) & (loop == 0)), APPROACH, AT_ONCE)
+        clock = torch.where((same == 0) & (ready > 0), -far / APPROACH, clock)  # a ball in the hands comes along
+        step = torch.where((clock < 0) | ((clock < 1) & (ready == 0)), APPROACH, AT_ONCE)
         target = last_target + torch.minimum(torch.maximum(target - last_target, -step), step)
-        return Planned(target, clock, error)
+        return Planned(target, mixed(self.poses), clock, error)
 
     def _step(
-        self, skill: Tensor, clock: Tensor, same: Tensor, last: Tensor, loop: Tensor, ball: Tensor
+        self, skill: Tensor, clock: Tensor, same: Tensor, last: Tensor, loop: Tensor, ball: Tensor, calm: Tensor
     ) -> tuple[Tensor, Tensor]:
         """The clock, moved on, and by how much: a row a tick, and faster or slower as the ball is ahead of its plan or behind.
 
@@ -160,6 +187,9 @@ class Plan(nn.Module):
         bounce = skill @ self.bounce
         ahead = torch.where(loop > 0, fallen - bounce * torch.round(fallen / bounce), along)  # s
         rate = torch.clamp(same + planned[:, 6:] * ahead, 0.0, 2.0)
+        soon = (row + torch.floor(rate)[:, 0].to(torch.int64) + 1).clamp(max=len(self.away) - 1)
+        lets_go = (self.away[row] == 0) & (self.away[soon] > 0)
+        rate = torch.where(lets_go & ~calm, 0.0, rate)
         moved = clock + rate
         around = moved - (last + 1) * torch.clamp(torch.floor(moved / (last + 1)), min=0.0)
         return torch.where(loop > 0, around, torch.minimum(moved, last)), rate

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from drivers.sim import ball
+from policies.clips.library import robot_clips
 from policies.evaluate import UNSEEN
 from policies.export import envelope, export
 from policies.skillmimic.config import SkillMimic
@@ -19,13 +20,13 @@ from policies.skillmimic.plan import samples
 from policies.skillmimic.starts import approach, first_clips, object_start, start_posture
 from policies.skillmimic.train import load_graph
 from policies.training import git_revision
-from sim2real.contract import Contract
+from sim2real.contract import Contract, Skill
 from sim2real.policy import Policy
 from sim2real.types import Sim2realError
 
-SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "walks", "corrections", "timed", "period",
+SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "walks", "bends", "corrections", "timed", "period",
             "timestep", "action_ratio", "action_max", "grip", "balance_gain", "balance_damping", "position_margin",
-            "history", "frames", "throw", "terminations")  # fmt: skip
+            "history", "frames", "throw", "placed", "terminations")  # fmt: skip
 SHOWN, NONE = (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)  # m/s, m/s, rad/s: commands of a timeline that names none
 GOLDEN_STEPS, GOLDEN = 40, 4  # ticks of each golden sequence, and how many
 
@@ -67,7 +68,9 @@ def export_graph(
         "skills": [
             {
                 "label": label,
-                "description": f"{label}, from retargeted clips",
+                "description": f"{label}, {origin(graph, clip)}",
+                # who is down goes through with it: from there no other skill begins
+                "dwell": graph.clips.seconds(clip) if label in config.bends else Skill.model_fields["dwell"].default,
                 "velocity": SHOWN if label in config.walks else NONE,
                 "object": object_start(graph, clip),
             }
@@ -94,6 +97,16 @@ def export_graph(
         },
     }
     return export(graph, path, fields=fields, sequences=sequences)
+
+
+def origin(graph: PolicyGraph, clip: int) -> str:
+    """Where clip number ``clip`` comes from."""
+    recorded = {c.name: c for c in robot_clips(graph.config.robot)}
+    return (
+        "by formula"
+        if recorded[graph.clips.names[clip]].header.source.startswith("policies/")
+        else "from retargeted clips"
+    )
 
 
 def settings(config: SkillMimic) -> str:

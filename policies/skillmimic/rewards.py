@@ -65,6 +65,7 @@ class Step(NamedTuple):
     joint_acceleration: np.ndarray  # (N, n) rad/s^2, over the policy period
     action_change: np.ndarray  # (N, actions)
     height: np.ndarray  # (N,) m, of the base
+    height_reference: np.ndarray  # (N,)
     up: np.ndarray  # (N,) cosine of its tilt
     up_reference: np.ndarray  # (N,)
     bounces: np.ndarray  # (N,) bool: the ball is to stay where it is, going up and down

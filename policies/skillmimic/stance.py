@@ -34,22 +34,21 @@ def crouched(body: RobotBody, home: np.ndarray, crouch: np.ndarray, height: floa
     return poses[best], float(heights[best])
 
 
-def trunk(body: RobotBody, pose: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
-    """Position (3,) m and orientation (4,) of the trunk of a robot that stands at ``pose`` (n,), base level at ``height``."""
-    return _place(mujoco.MjData(body.model), body, np.array([0, 0, height]), LEVEL, pose)
+def trunks(body: RobotBody, clip: Clip) -> tuple[np.ndarray, np.ndarray]:
+    """Position (T, 3) m and orientation (T, 4) of the trunk in a robot's clip."""
+    data = mujoco.MjData(body.model)
+    rows = zip(clip.base_position_in_world, clip.base_orientation_in_world, clip.joint_pos, strict=True)
+    places, turns = zip(*[_place(data, body, *row) for row in rows], strict=True)
+    return np.array(places), np.array(turns)
 
 
 def stand(clip: Clip, body: RobotBody, pose: np.ndarray, height: float) -> Clip:
     """The clip's arms and ball on a robot whose other joints are at ``pose`` (n,) rad, base level at ``height`` m."""
     arms = np.array([j.group == "arm" for j in body.robot.joints])
     data = mujoco.MjData(body.model)
-    frames = [
-        _place(data, body, *row)
-        for row in zip(clip.base_position_in_world, clip.base_orientation_in_world, clip.joint_pos, strict=True)
-    ]
-    there, turned = (np.array(x) for x in zip(*frames, strict=True))
+    there, turned = trunks(body, clip)
     base = np.array([0, 0, height])
-    here, facing = trunk(body, pose, height)
+    here, facing = _place(data, body, base, LEVEL, pose)
     turn = multiply(np.tile(facing, (len(clip), 1)), conjugate(turned))
     joint_pos = np.where(arms, clip.joint_pos, pose)
     points = np.zeros((len(clip), len(POINT_NAMES), 3))

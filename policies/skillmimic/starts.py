@@ -70,7 +70,7 @@ def aiming(graph: PolicyGraph, clip: int) -> float:
 
 def start_posture(graph: PolicyGraph) -> np.ndarray:
     """(n,) rad, where the soft start ends: the posture of the first skill; legs and waist as a base policy stands."""
-    return np.where(graph.acts.numpy() > 0, graph.postures[0].numpy(), graph.clips.stances[0])
+    return np.where(graph.acts.numpy() > 0, graph.clips.start(), graph.clips.stance[0])
 
 
 def approach(graph: PolicyGraph) -> list[float]:
@@ -83,12 +83,12 @@ def approach(graph: PolicyGraph) -> list[float]:
         if clip.name not in clips.names or not both[0]:
             continue
         if graph.base is not None:
-            clip = stand(clip, body, clips.stances[0], float(standing_height(body.model, clips.stances[:1])[0]))
+            clip = stand(clip, body, clips.stance[0], float(standing_height(body.model, clips.stance[:1])[0]))
         g = grip(clip, graph.model, body, graph.kp, force=0.0)
         postures.append((clip.joint_pos + g.effort - g.press * (OPEN / PRESS))[both].mean(axis=0))
     if not postures:
         return []
-    posture = np.where(graph.acts.numpy() > 0, np.mean(postures, axis=0), clips.stances[0])
+    posture = np.where(graph.acts.numpy() > 0, np.mean(postures, axis=0), clips.stance[0])
     return np.clip(posture, graph.lower.numpy(), graph.upper.numpy()).tolist()
 
 

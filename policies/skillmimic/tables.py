@@ -53,15 +53,14 @@ def sweeps(graph: PolicyGraph, episodes: int, seconds: float, act: Act, tell: Te
 
 
 def pairs(graph: PolicyGraph) -> list[tuple[str, str]]:
-    """Every two skills of which the first ends, and the second begins, with the ball in both hands; one that bounces it
-    does not end."""
+    """Every two skills of which the first ends, or begins again, with the ball in both hands, and the second begins so."""
     begins, ends = [], []
     for label in graph.labels:
         clips = [c for c in robot_clips(graph.config.robot, label) if c.name in graph.clips.names]
         starts = all(c.contact[0, :2].all() for c in clips)
         begins += [label] * starts
-        if label not in graph.config.loop:
-            ends += [label] * (starts if label in graph.config.swing else all(c.contact[-1, :2].all() for c in clips))
+        goes_on = label in (*graph.config.swing, *graph.config.loop)
+        ends += [label] * (starts if goes_on else all(c.contact[-1, :2].all() for c in clips))
     return [(a, b) for a in ends for b in begins if a != b]
 
 
@@ -84,16 +83,19 @@ def switched(graph: PolicyGraph, first: str, second: str, episodes: int, act: Ac
     ticks = np.array([ticks_of(graph, clip, SECOND) for clip in nexts])
     rest = np.where(clips.swing[env.clip] | clips.loop[env.clip], np.inf, clips.length[env.clip])  # rows
     waited = aiming(graph, int(env.clip[0]))
-    began, ended = np.full((2, episodes), -1)
+    asked, began, ended = np.full((3, episodes), -1)
     lost, up = np.zeros(episodes, bool), np.full(episodes, True)
     rows: list[Trace] = []
     with torch.no_grad():
         while not (lost | (ended >= 0)).all():
             late = len(rows) * config.period >= FIRST + waited
-            due = (began < 0) & ~lost & (late | (env.since - rest >= REST / config.timestep))
+            due = (asked < 0) & ~lost & (late | (env.since - rest >= REST / config.timestep))
             if due.any():
-                began[due] = len(rows)
-                switch(env, np.flatnonzero(due), nexts[due])
+                asked[due] = len(rows)
+                ask(env, np.flatnonzero(due), second)
+            now = (asked >= 0) & (began < 0) & ~lost & performs(env, second)
+            began[now] = len(rows)
+            env.clip[now], env.row[now], env.since[now] = nexts[now], 0, 0
             _, _, dones, _ = env.step(act(env))
             running, over = (began >= 0) & (ended < 0), dones.numpy().astype(bool)
             up &= ~(running & env.failures)
@@ -109,8 +111,13 @@ def switched(graph: PolicyGraph, first: str, second: str, episodes: int, act: Ac
     )
 
 
-def switch(env: Env, ids: np.ndarray, clips: np.ndarray) -> None:
-    """The robots ``ids`` (k,) are told to do now what ``clips`` (k,) show; nothing else about them changes."""
-    env.clip[ids], env.row[ids], env.since[ids] = clips, 0, 0
-    env.skill[ids] = one_hot(env.clips.skill[clips], len(env.graph.labels))
+def ask(env: Env, ids: np.ndarray, label: str) -> None:
+    """The robots ``ids`` (k,) are told to do ``label`` now; nothing else about them changes."""
+    env.skill[ids] = one_hot([env.graph.labels.index(label)], len(env.graph.labels))
     env._observe()
+
+
+def performs(env: Env, label: str) -> np.ndarray:
+    """(envs,) bool: who does ``label`` in this tick. A ball in the air is caught before another skill begins."""
+    done = env.measured.carried.get("carry_skill", env.skill)
+    return done[:, env.graph.labels.index(label)].numpy() > 0

@@ -11,7 +11,7 @@ from policies.skillmimic.rewards import Step
 # m between ball and its reference, seen from the first key point, while the reference has it in hand; of a ball that
 # bounces, at any time and over the floor: after that one the robot can still go
 BALL_LOST, BALL_GONE = 0.3, 0.5
-FALLEN = 0.3  # m: the base; the retargeted pickup bends down to 0.48
+FALLEN, SUNK = 0.3, 0.2  # m: how low a base has fallen; and how far below its reference, where that is as low
 
 
 def up(orientation_base_in_world: np.ndarray) -> np.ndarray:
@@ -28,7 +28,7 @@ def _ball_lost(s: Step) -> np.ndarray:
 
 
 TERMINATIONS: dict[str, Callable[[Step], np.ndarray]] = {
-    "fallen": lambda s: s.height < FALLEN,
+    "fallen": lambda s: s.height < np.minimum(FALLEN, s.height_reference - SUNK),
     # 0.6 rad more than the reference leans; a bending pickup leans too
     "tilted": lambda s: np.arccos(np.clip(s.up, -1, 1)) > np.arccos(np.clip(s.up_reference, -1, 1)) + 0.6,
     "ball_lost": _ball_lost,

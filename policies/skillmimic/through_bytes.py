@@ -81,29 +81,32 @@ class Judge:
         state, qvel = body.motion(touched), body.velocity()
         since = simulation.since - self._began if before is None else before * config.period
         row = np.array([round(since / config.timestep)])
-        reference = clips.motion(*clips.rows(np.array([self.clip]), row))
-        height, tilt, there = state.points[:, 0, 2], *(up(m.orientation_base_in_world) for m in (state, reference))
-        apart = np.linalg.norm(state.object_position - state.points[:, 0], axis=1)
-        state, reference = self._comparable(state, reference, qvel, body)
+        rows, way = clips.rows(np.array([self.clip]), row)
+        reference = clips.motion(rows, way)
+        tilt = [up(m.orientation_base_in_world) for m in (state, reference)]
+        low = [m.points[:, 0, 2] for m in (state, reference)]
+        apart, lifted = np.linalg.norm(state.object_position - state.points[:, 0], axis=1), state.object_position[:, 2]
+        state, reference = self._comparable(state, reference, qvel, body, rows)
         ends = not (clips.swing[self.clip] or clips.loop[self.clip])
         if ends and row[0] >= clips.length[self.clip] and not reference.contact[0, 0]:  # it flies where it may
             reference = reference._replace(object_position=state.object_position, object_velocity=state.object_velocity)
-        step = Step(state, reference, np.zeros((1, 1)), np.zeros((1, 1)), height, tilt, there, clips.loop[[self.clip]])
+        step = Step(state, reference, np.zeros((1, 1)), np.zeros((1, 1)), *low, *tilt, clips.loop[[self.clip]])
         self.failed = bool(failed(step, config.terminations)[0])
         self.sums += np.array(measure(step))[:, 0]
-        self._rows.append((touched[0], state.object_velocity[0], apart[0], height[0], not self.failed))
+        self._rows.append((touched[0], state.object_velocity[0], apart[0], lifted[0], low[0][0], not self.failed))
 
     def _now(self, policy: Any) -> float | None:
         """How far the plan is, in ticks, of a skill whose plan waits for its ball."""
         waits = self.graph.base is not None and self.label in self.graph.config.timed
         return max(0.0, float(policy.carries["carry_clock"][0])) if waits else None
 
-    def _comparable(self, state: Motion, reference: Motion, qvel: np.ndarray, body: _Body) -> tuple[Motion, Motion]:
+    def _comparable(
+        self, state: Motion, reference: Motion, qvel: np.ndarray, body: _Body, rows: np.ndarray
+    ) -> tuple[Motion, Motion]:
         """Both where training compares them: seen from the trunk if the legs are a base policy's, else laid on the clip."""
         clips, graph = self.graph.clips, self.graph
         if graph.base is not None:
-            stance = clips.skill[[self.clip]]
-            there = clips.trunk_position[stance], clips.trunk_orientation[stance]
+            there = clips.trunk_position[rows], clips.trunk_orientation[rows]
             state = arms(moved(state, qvel, body.trunk(), there), graph.acting)
             reference = arms(reference, graph.acting)
         else:
@@ -227,6 +230,9 @@ def deploy_episode(
     if starts[label].how == "thrown":
         flight = starts[label].velocity + rng.uniform(-config.throw, config.throw, 3)
         starts[label] = starts[label].model_copy(update={"velocity": tuple(flight.tolist())})
+    elif starts[label].how == "placed":
+        place = starts[label].position + np.append(rng.uniform(-config.placed, config.placed, 2), 0.0)
+        starts[label] = starts[label].model_copy(update={"position": tuple(place.tolist())})
     simulation.handover = Handover(simulation.world, starts)
     summary = simulation.run()
     judge.failed |= bool(summary.faults) or judge.frames < ticks

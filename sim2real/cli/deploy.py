@@ -175,8 +175,12 @@ def _operator(args: Args, labels: list[str], policies, unshown: Collection[str])
     elif args.skill:
         steps = [Step(args.skill, args.duration or 10.0, args.velocity)]
     else:
-        shown = {s.label: s.velocity for policy in policies for s in policy.contract.skills}
-        rest = (Step(label, 5.0, shown[label]) for label in labels[1:] if label not in unshown)
+        shown = {s.label: s for policy in policies for s in policy.contract.skills}
+        rest = (
+            Step(label, max(5.0, shown[label].dwell + 1.0), shown[label].velocity)
+            for label in labels[1:]
+            if label not in unshown
+        )
         steps = [Step(labels[0], 2.0), *rest, Step(labels[0], 2.0)]
     for step in steps:
         if step.skill not in labels:

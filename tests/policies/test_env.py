@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from policies import randomisation
-from policies.basics import MOTIONS, Basics
+from policies.basics import MOTIONS, Basics, down
 from policies.env import Env, multiply
 from policies.graph import PolicyGraph
 from policies.randomisation import TABLE
@@ -192,6 +192,25 @@ def test_busy_bodies_move_arms_trunk_and_knees_and_nothing_tells_the_balance():
     groups = [j.group for j in load_robot(CONFIG.robot).joints]
     assert {g for g, m in zip(groups, moved.tolist(), strict=True) if m} == {"arm", "waist", "leg"}
     assert all(m or g == "leg" for g, m in zip(groups, moved.tolist(), strict=True))
+
+
+def test_robots_on_their_way_down_stand_on_flat_soles_wherever_they_start():
+    env = Env(dataclasses.replace(CONFIG, envs=64, down=1.0, home_start=0.0), seed=0, level=1.0)
+    stands = env.skill[:, env.graph.labels.index("stand")]
+    assert (stands == 1).all()
+    share = env._down
+    assert share.min() < 0.2 and share.max() > 0.8
+    pose = env.graph.home.numpy() + down(env.graph.joint_names, share)
+    heights = env.stature.height(pose)
+    assert np.ptp(heights) > 0.3
+    data = mujoco.MjData(env.model)
+    feet = [g for g in range(env.model.ngeom) if "_foot_" in env.model.geom(g).name]
+    for joints, pitch, height in zip(pose, env.stature.pitch(pose), heights, strict=True):
+        data.qpos[:] = [0, 0, height, np.cos(pitch / 2), 0, np.sin(pitch / 2), 0, *joints]
+        mujoco.mj_forward(env.model, data)
+        np.testing.assert_allclose(data.geom_xpos[feet, 2] - env.model.geom_size[feet, 0], 0.0, atol=2e-3)
+        ankle = data.xanchor[env.model.joint("left_ankle_pitch_joint").id, 0]
+        assert 0.02 < data.subtree_com[1, 0] - ankle < 0.06  # of 12 cm to the toes
 
 
 def test_commands_are_for_skills_that_walk():

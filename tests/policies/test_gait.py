@@ -32,6 +32,22 @@ def test_without_a_reason_both_feet_rest(phase):
     assert clock(phase, 5) == [phase] * 5
 
 
+def test_bent_legs_do_not_step():
+    falling = STILL._replace(forward=torch.tensor([[1.0]]))
+    advanced = [
+        GAIT.advance(torch.zeros(1, 1), NONE, falling, GAIT.capture(falling), b) for b in (0.0, STRIDE.bow + 0.01)
+    ]
+    assert advanced[0] > 0 and advanced[1] == 0
+
+
+def test_a_pose_with_flat_soles_pitches_the_base():
+    bend = torch.zeros(1, len(ROBOT.joint_names))
+    for side in ("left", "right"):
+        for part, angle in (("hip_pitch", -1.0), ("knee", 0.7), ("ankle_pitch", -0.3)):
+            bend[0, ROBOT.joint_names.index(f"{side}_{part}_joint")] = angle
+    assert GAIT.pitch(bend).item() == pytest.approx(0.6)
+
+
 def test_a_command_starts_the_clock_and_it_goes_round():
     phases = clock(0.0, 50, FORWARD)
     assert phases[0] == pytest.approx(0.02 / STRIDE.period)

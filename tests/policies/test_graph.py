@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from policies.basics import MOTIONS, Basics
+from policies.basics import MOTIONS, Basics, down
 from policies.graph import PolicyGraph, one_hot
-from policies.observations import Signals
+from policies.observations import Signals, gravity_in_base, pitched
 from sim2real.config import load_robot
 
 GRAPH = PolicyGraph(Basics())
@@ -34,6 +34,14 @@ def test_upright_only_the_ankles_know_of_balance():
     ankles = [k for k, name in enumerate(GRAPH.joint_names) if "ankle_pitch" in name]
     assert set(torch.nonzero(offsets).flatten().tolist()) == set(ankles)
     torch.testing.assert_close(offsets[ankles], torch.full((2,), GRAPH.config.balance_offset))
+
+
+def test_a_pitch_that_the_pose_asks_for_is_none_to_balance_against():
+    pose = torch.tensor(down(GRAPH.joint_names, np.ones(1)), dtype=torch.float32)
+    pitch = float(GRAPH.gait.pitch(pose))
+    assert 0.5 < pitch < 0.7
+    turned = torch.tensor([[np.cos(pitch / 2), 0.0, np.sin(pitch / 2), 0.0]])
+    np.testing.assert_allclose(pitched(gravity_in_base(turned), torch.tensor([[pitch]])), [[0.0, 0.0, -1.0]], atol=1e-6)
 
 
 def test_ankles_push_against_pitch_and_pitch_rate():

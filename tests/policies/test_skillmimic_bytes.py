@@ -45,7 +45,7 @@ def test_the_contract_has_the_legs_of_the_stance_and_the_commands_of_the_base(gr
     contract = load_policy(file, trial=0).contract
     legs = graph.acts.numpy() == 0
     for posture in (contract.default_joint_pos, contract.approach_joint_pos):
-        np.testing.assert_allclose(np.array(posture)[legs], graph.clips.stances[HOLD][legs], atol=1e-6)
+        np.testing.assert_allclose(np.array(posture)[legs], graph.clips.stance[0][legs], atol=1e-6)
     np.testing.assert_allclose(np.array(contract.default_joint_pos)[~legs], graph.postures[HOLD].numpy()[~legs])
     assert np.abs(start_posture(graph) - approach(graph))[~legs].max() > 0.05
     assert contract.command_velocity_max[0] == graph.base.config.command_high[0] > 0
@@ -121,8 +121,8 @@ def test_only_walking_skills_are_told_a_velocity(graph):
 
 def test_a_robot_that_is_moved_and_turned_with_its_ball_is_seen_alike(graph):
     clips = graph.clips
-    m = clips.motion(*clips.rows(np.array([HOLD]), np.array([30])))
-    there = clips.trunk_position[[HOLD]], clips.trunk_orientation[[HOLD]]
+    rows, way = clips.rows(np.array([HOLD]), np.array([30]))
+    m, there = clips.motion(rows, way), (clips.trunk_position[rows], clips.trunk_orientation[rows])
     turn, shift = np.array([np.cos(0.4), 0.0, 0.0, np.sin(0.4)]), np.array([1.0, -2.0, 0.1])
     place = lambda x: rotate(turn, x) + shift  # noqa: E731
     spin, drift = np.array([0.1, 0.2, 0.3]), np.array([0.4, 0.0, 0.1])

@@ -29,26 +29,28 @@ def axis(up: float, tip: float = 0.0, aside: float = 0.0) -> list[float]:
     return [0.0, 0.0, up, tip, aside]
 
 
-def rows(loop: bool = False, pull: float = 0.0) -> Rows:
-    """A ball that flies forwards at 1 m/s, 2 cm a row, and one joint that follows the row's number."""
+def rows(loop: bool = False, pull: float = 0.0, ready: bool = False, away: int = T) -> Rows:
+    """A ball that flies forwards at 1 m/s, 2 cm a row, one joint that follows the row's number, and a base that goes down."""
     t = np.arange(T)
     ball = np.column_stack([t * 0.02, np.zeros(T), np.zeros(T)])
     back = np.zeros((T, ARMS, 5))
     back[:, 1, 2] = 2.0  # a metre up is two radians of the second joint
     back[:, 0, 3] = 1.0  # the first one tips the palm forwards,
     back[:, 1, 4] = 1.0  # and the second to the left
-    return Rows(
-        np.column_stack([t * 0.1, np.zeros(T)]), ball, np.tile([1.0, 0, 0], (T, 1)), back, loop, np.full(T, pull)
-    )
+    target, pose = np.column_stack([t * 0.1, np.zeros(T)]), np.column_stack([-t * 0.2, np.zeros(T), np.zeros(T)])
+    velocity = np.tile([1.0, 0, 0], (T, 1))
+    return Rows(target, pose, ball, velocity, back, loop, loop or ready, np.arange(T) >= away, np.full(T, pull))
 
 
 def correction(offset: float = 0.0, follow: list[float] = NONE, damp: list[float] = NONE) -> Correction:
     return Correction(np.tile([offset, 0.0], (KNOTS, 1)), np.array(follow), np.array(damp))
 
 
-def at(plan: Plan, clock: float, ball: list[float], skill: int = 0, before: int = 0, target: float = 0.0):
-    one, last = torch.eye(len(plan.first)), torch.full((1, ARMS), target)
-    return plan(one[[skill]], one[[before]], torch.tensor([[clock]]), last, torch.tensor([ball], dtype=torch.float32))
+def at(
+    plan: Plan, clock: float, ball: list[float], skill: int = 0, before: int = 0, target: float = 0.0, calm: bool = True
+):
+    one, last, seen = torch.eye(len(plan.first)), torch.full((1, ARMS), target), torch.tensor([ball]).float()
+    return plan(one[[skill]], one[[before]], torch.tensor([[clock]]), last, seen, torch.tensor([[calm]]))
 
 
 def where(row: float) -> list[float]:
@@ -140,6 +142,35 @@ def test_a_loop_begins_when_the_arms_are_where_it_does():
     again = at(plan, T - 0.5, where(0), skill=1, before=1, target=1.0)  # around, and at once
     np.testing.assert_allclose(again.clock, [[0.5]], atol=1e-6)
     np.testing.assert_allclose(again.target, [[0.05, 0.0]], atol=1e-6)
+
+
+def test_a_ball_that_lies_waits_for_the_arms_too_and_the_base_with_them():
+    plan = Plan([rows(), rows(ready=True)], [correction()] * 2)
+    p = at(plan, 5.0, where(0), skill=1, before=0, target=3.5 * APPROACH)
+    assert float(p.clock) == pytest.approx(-3.5)
+    np.testing.assert_allclose(p.pose, [[0.0, 0.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(at(plan, 2.5, where(3), skill=1, before=1).pose, [[-0.7, 0.0, 0.0]], atol=1e-6)
+
+
+@pytest.mark.parametrize(("clock", "ball", "goes_on"), [(5.0, where(5), True), (3.0, where(3), False),
+                                                        (5.0, [5.0, 0, 0, 1, 0, 0], False)])  # fmt: skip
+def test_a_ball_in_the_air_is_caught_before_another_skill_begins_unless_it_is_lost(clock, ball, goes_on):
+    plan, one = Plan([rows(loop=True, away=4), rows()], [correction()] * 2), torch.eye(2)
+    done = plan.performed(one[[1]], one[[0]], torch.tensor([[clock]]), torch.tensor([ball]).float())
+    assert torch.equal(done, one[[0 if goes_on else 1]])
+
+
+def test_at_the_first_tick_there_is_nothing_to_finish():
+    plan, one = Plan([rows(loop=True, away=0), rows()], [correction()] * 2), torch.eye(2)
+    assert torch.equal(plan.performed(one[[1]], 0 * one[[0]], torch.zeros(1, 1), torch.zeros(1, 6)), one[[1]])
+
+
+def test_no_ball_is_let_go_while_the_feet_step():
+    plan = Plan([rows(loop=True, away=4)], [correction()])
+    clocks = {
+        calm: [float(at(plan, c, where(c + 1), calm=calm).clock) for c in (2.0, 3.0, 5.0)] for calm in (True, False)
+    }
+    assert clocks == {True: [3.0, 4.0, 6.0], False: [2.0, 3.0, 6.0]}
 
 
 def test_palms_do_not_follow_a_ball_that_the_plan_still_waits_for():

@@ -26,7 +26,7 @@ def motion(**changes: np.ndarray) -> Motion:
 
 def step(state: Motion, **more: np.ndarray) -> Step:
     rest = {"joint_acceleration": np.zeros((N, J)), "action_change": np.zeros((N, A)), "height": np.full(N, 0.79),
-            "up": np.ones(N), "up_reference": np.ones(N), "bounces": np.zeros(N, bool)}  # fmt: skip
+            "height_reference": np.full(N, 0.79), "up": np.ones(N), "up_reference": np.ones(N), "bounces": np.zeros(N, bool)}  # fmt: skip
     return Step(state, motion(), **(rest | more))
 
 

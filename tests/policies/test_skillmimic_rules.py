@@ -10,10 +10,10 @@ from policies.skillmimic.evaluate import LEAST, Trace, succeeded
 PERIOD, TICKS = 0.02, 100
 
 
-def trace(held, velocity=(0.0, 0.0, 0.0), up=True, apart=0.4, height=0.7) -> Trace:
+def trace(held, velocity=(0.0, 0.0, 0.0), up=True, apart=0.4, height=0.7, lifted=0.8) -> Trace:
     held = np.asarray(held, bool)
     up = np.broadcast_to(up, held.shape).copy()
-    rows = [np.full(len(held), x) for x in (apart, height)]
+    rows = [np.full(len(held), x) if np.ndim(x) == 0 else x for x in (apart, lifted, height)]
     return Trace(held, np.tile(velocity, (len(held), 1)), *rows, up)
 
 
@@ -45,6 +45,14 @@ def test_a_throw_lets_go_and_the_robot_stands():
     again = holds(40, 60)
     again[80:] = True  # it took the ball back
     assert success("shot", trace(again, fast)) == 0
+
+
+def test_a_ball_is_picked_up_where_it_ends_above_a_metre_at_the_size_of_the_robot():
+    low, high = 0.74, 0.75
+    assert success("pickup", trace(holds(0, TICKS), lifted=high)) == 1
+    assert success("pickup", trace(holds(0, TICKS), lifted=low)) == 0
+    assert success("pickup", trace(holds(0, TICKS), lifted=np.r_[np.full(TICKS - 1, high), low])) == 0
+    assert success("pickup", trace(holds(0, TICKS), lifted=high, up=np.arange(TICKS) < TICKS - 1)) == 0
 
 
 def test_a_catch_holds_until_the_end():

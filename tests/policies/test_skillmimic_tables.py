@@ -68,9 +68,9 @@ def test_pairs_hand_the_ball_from_both_hands_to_both_hands(graph):
     assert pairs(graph) == [("hold", "carry"), ("carry", "hold"), ("catch", "hold"), ("catch", "carry")]
 
 
-def test_a_ball_that_is_bounced_is_handed_to_nobody():
+def test_a_ball_that_is_bounced_comes_back_to_the_hands():
     bounce = dataclasses.replace(CONFIG, skills=("hold", "bounce"), clips=("hold_05", "bounce_01"))
-    assert pairs(PolicyGraph(bounce)) == [("hold", "bounce")]
+    assert pairs(PolicyGraph(bounce)) == [("hold", "bounce"), ("bounce", "hold")]
 
 
 def test_a_switch_is_told_once_and_judged_by_the_second_skill(graph, monkeypatch):
