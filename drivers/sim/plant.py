@@ -247,10 +247,10 @@ class Plant:
 
     @property
     def fallen(self) -> bool:
-        """The centre of mass is below half the height at which it stood at reset, or the base leans by more than 1 rad.
+        """The centre of mass is below a third of the height at which it stood at reset, or the base leans by more than 1 rad.
 
-        Not the base's height: some makers put its frame on the floor."""
-        return bool(self.floating and (self.data.subtree_com[self._root, 2] < 0.5 * self._stood or self.tilt > 1.0))
+        Not the base's height: some makers put its frame on the floor. Not half of it: who picks something up is as low."""
+        return bool(self.floating and (self.data.subtree_com[self._root, 2] < self._stood / 3 or self.tilt > 1.0))
 
     def truth(self) -> Truth:
         velocity = np.zeros(6)

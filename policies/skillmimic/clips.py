@@ -180,7 +180,8 @@ class ReferenceClips:
         loop = bool(self.loop[clip])
         ready = loop or not (m.contact[at[0], 0] or pulls[0])
         away = (m.contact[at[: len(target)], 0] == 0) & loop & self.hands[clip].all()
-        return Rows(target, pose, ball_in_base, velocity, back, loop, ready, away, pulls)
+        bends = self._config.skills[skill] in self._config.bends
+        return Rows(target, pose, ball_in_base, velocity, back, loop, ready, bends, away, pulls)
 
     def _gone(self, clip: int, at: np.ndarray) -> np.ndarray:
         """(rows,) bool: whether the ball has left the hands for good."""

@@ -16,7 +16,7 @@ from sim2real.simulation import Simulation
 
 TRIES = 5  # runs, of which the first good one is shown, else the last
 GOOD = 0.5  # success of one
-SECONDS = 4.0  # of the skill
+SECONDS = 4.0  # of a skill that does not end by itself
 LEAD = 0.6  # s shown of the skill before it
 SIZE, RATE = (300, 260), 12.5  # pixels, Hz: a few hundred kB
 
@@ -26,15 +26,17 @@ def film(path: Path, graph: PolicyGraph, label: str, gif: Path) -> int:
     run it shows, from 1; 0: none was good, it shows the last."""
     clips = np.flatnonzero(graph.clips.skill == graph.labels.index(label))
     skill = before(graph, int(clips[0]))  # s: when it begins
+    endless = label in (*graph.config.swing, *graph.config.loop)
+    seconds = SECONDS if endless else np.inf
 
     def run(seed: int, watch: Callable[[Simulation], None] = lambda simulation: None) -> bool:
         clip = int(clips[seed % len(clips)])
-        return deploy_episode(path, graph, clip, SECONDS, CameraModel(), seed, watch).success >= GOOD
+        return deploy_episode(path, graph, clip, seconds, CameraModel(), seed, watch).success >= GOOD
 
     good = next((seed for seed in range(TRIES) if run(seed)), -1)
     gif.parent.mkdir(parents=True, exist_ok=True)
     camera = Camera(gif, rate=RATE, width=SIZE[0], height=SIZE[1], distance=3.0)
-    end = skill + ticks_of(graph, int(clips[good % TRIES % len(clips)]), SECONDS) * graph.config.period
+    end = skill + ticks_of(graph, int(clips[good % TRIES % len(clips)]), seconds) * graph.config.period
 
     def watch(simulation: Simulation) -> None:
         if max(0.0, skill - LEAD) <= simulation.since <= end:

@@ -26,6 +26,7 @@ KNOTS = 8  # of a skill that moves
 # The furthest that palms follow the ball: m forwards, left, up; rad tipped forwards, left.
 REACH = np.array([0.15, 0.15, 0.25, 0.5, 0.5])
 TIPS = slice(3, 5)  # of these
+SETTLE = 25.0  # rows for which the feet rest before legs bend
 LOST = 0.4  # m from its plan: a ball farther away does not come back
 SLOW = 0.5  # m/s: a ball slower than this says little about the time
 # rad a tick: how fast targets go to where a skill begins. Arms that are thrown there throw the robot off its feet.
@@ -54,6 +55,7 @@ class Rows:
     back: np.ndarray  # (T, arms, 5)
     loop: bool
     ready: bool  # it begins when the arms are there: neither a ball in the hands nor one in the air brings them
+    bends: bool  # it moves the base
     away: np.ndarray  # (T,) bool: the ball comes back to both hands, and until then nothing else can begin
     pull: np.ndarray  # (T,) rows a tick per s that the ball is ahead, of a clock that follows it; 0: it runs by itself
     knots: np.ndarray = field(init=False)  # (T, KNOTS) shares of the knots in each row
@@ -87,6 +89,7 @@ class Plan(nn.Module):
     last: Tensor
     loop: Tensor
     ready: Tensor
+    settle: Tensor
     away: Tensor
     poses: Tensor
     bounce: Tensor
@@ -114,6 +117,7 @@ class Plan(nn.Module):
         self.register_buffer("bounce", _buffer(np.array(jumps)[:, None]))
         self.register_buffer("loop", _buffer([[r.loop] for r in rows]))
         self.register_buffer("ready", _buffer([[r.ready] for r in rows]))
+        self.register_buffer("settle", _buffer([[SETTLE * r.bends] for r in rows]))
         self.register_buffer("away", _buffer(np.concatenate([r.away for r in rows])[:, None]))
         self.register_buffer("poses", _buffer(np.concatenate([r.pose for r in rows])))
         self.register_buffer("offsets", _buffer(np.stack([c.offsets for c in corrections])))
@@ -145,7 +149,7 @@ class Plan(nn.Module):
     ) -> Planned:
         """``skill`` (N, labels) one-hot, and that of the tick before with its clock (N, 1) and targets (N, arms); ``ball``
         (N, 6) m and m/s in the base; ``calm`` (N, 1) bool: the feet rest, without which no ball is let go that is to come
-        back."""
+        back, and no leg bent."""
         same = (skill * last_skill).sum(dim=-1, keepdim=True)
         last, loop, ready = skill @ self.last, skill @ self.loop, skill @ self.ready
         clock, rate = self._step(skill, same * last_clock, same, last, loop, ball, calm)
@@ -165,7 +169,8 @@ class Plan(nn.Module):
         target = planned[:, : self.arms] + (mixed(self.knots)[:, :, None] * offsets).sum(dim=1)
         target = target + (self.back[row] * wanted[:, None]).sum(dim=-1)
         far = (target - last_target).abs().amax(dim=-1, keepdim=True)
-        clock = torch.where((same == 0) & (ready > 0), -far / APPROACH, clock)  # a ball in the hands comes along
+        begin = -far / APPROACH - skill @ self.settle
+        clock = torch.where((same == 0) & (ready > 0), begin, clock)  # a ball in the hands comes along
         step = torch.where((clock < 0) | ((clock < 1) & (ready == 0)), APPROACH, AT_ONCE)
         target = last_target + torch.minimum(torch.maximum(target - last_target, -step), step)
         return Planned(target, mixed(self.poses), clock, error)
@@ -189,7 +194,8 @@ class Plan(nn.Module):
         rate = torch.clamp(same + planned[:, 6:] * ahead, 0.0, 2.0)
         soon = (row + torch.floor(rate)[:, 0].to(torch.int64) + 1).clamp(max=len(self.away) - 1)
         lets_go = (self.away[row] == 0) & (self.away[soon] > 0)
-        rate = torch.where(lets_go & ~calm, 0.0, rate)
+        settles = (clock < 0) & (skill @ self.settle > 0)
+        rate = torch.where((lets_go | settles) & ~calm, 0.0, rate)
         moved = clock + rate
         around = moved - (last + 1) * torch.clamp(torch.floor(moved / (last + 1)), min=0.0)
         return torch.where(loop > 0, around, torch.minimum(moved, last)), rate

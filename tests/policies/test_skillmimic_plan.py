@@ -17,7 +17,7 @@ from policies.skillmimic.config import TASKS
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PULL, PolicyGraph
 from policies.skillmimic.optimise import Search, optimise, score, write
-from policies.skillmimic.plan import APPROACH, KNOTS, REACH, TIPS, Correction, Plan, Rows, read, samples
+from policies.skillmimic.plan import APPROACH, KNOTS, REACH, SETTLE, TIPS, Correction, Plan, Rows, read, samples
 from sim2real.types import Sim2realError
 
 ARMS, T = 2, 8
@@ -29,7 +29,7 @@ def axis(up: float, tip: float = 0.0, aside: float = 0.0) -> list[float]:
     return [0.0, 0.0, up, tip, aside]
 
 
-def rows(loop: bool = False, pull: float = 0.0, ready: bool = False, away: int = T) -> Rows:
+def rows(loop: bool = False, pull: float = 0.0, ready: bool = False, bends: bool = False, away: int = T) -> Rows:
     """A ball that flies forwards at 1 m/s, 2 cm a row, one joint that follows the row's number, and a base that goes down."""
     t = np.arange(T)
     ball = np.column_stack([t * 0.02, np.zeros(T), np.zeros(T)])
@@ -39,7 +39,7 @@ def rows(loop: bool = False, pull: float = 0.0, ready: bool = False, away: int =
     back[:, 1, 4] = 1.0  # and the second to the left
     target, pose = np.column_stack([t * 0.1, np.zeros(T)]), np.column_stack([-t * 0.2, np.zeros(T), np.zeros(T)])
     velocity = np.tile([1.0, 0, 0], (T, 1))
-    return Rows(target, pose, ball, velocity, back, loop, loop or ready, np.arange(T) >= away, np.full(T, pull))
+    return Rows(target, pose, ball, velocity, back, loop, loop or ready, bends, np.arange(T) >= away, np.full(T, pull))
 
 
 def correction(offset: float = 0.0, follow: list[float] = NONE, damp: list[float] = NONE) -> Correction:
@@ -171,6 +171,13 @@ def test_no_ball_is_let_go_while_the_feet_step():
         calm: [float(at(plan, c, where(c + 1), calm=calm).clock) for c in (2.0, 3.0, 5.0)] for calm in (True, False)
     }
     assert clocks == {True: [3.0, 4.0, 6.0], False: [2.0, 3.0, 6.0]}
+
+
+def test_legs_bend_when_the_feet_have_rested_for_a_while():
+    plan = Plan([rows(), rows(ready=True, bends=True)], [correction()] * 2)
+    assert float(at(plan, 5.0, where(0), skill=1, before=0).clock) == -SETTLE
+    clocks = [float(at(plan, -3.0, where(0), skill=1, before=1, calm=calm).clock) for calm in (True, False)]
+    assert clocks == [-2.0, -3.0]
 
 
 def test_palms_do_not_follow_a_ball_that_the_plan_still_waits_for():
