@@ -46,6 +46,17 @@ class Refusal(NamedTuple):
     reason: str
 
 
+def blended(config: RobotConfig) -> np.ndarray:
+    """(n,) 1 for joints whose targets blend from one policy's to another's, 0 for legs: those that step go on stepping, and
+    half of one policy's targets and half of another's is no way to stand."""
+    return np.array([joint.group != "leg" for joint in config.joints], float)
+
+
+def blend(target: np.ndarray, before: np.ndarray, share: float, blended: np.ndarray) -> np.ndarray:
+    """(n,) rad on the way from ``before`` to ``target``, ``share`` of it gone, for the joints that are ``blended``."""
+    return target + blended * (1 - share) * (before - target)
+
+
 class SkillPlayer:
     """Runs the skills of one or more policies on one robot.
 
@@ -55,7 +66,7 @@ class SkillPlayer:
 
     Labels of all policies share one namespace (``labels``). A wish for another label is granted if the contract allows
     the transition, the current skill has had its dwell time, and the policy expects to manage it (``value_min``);
-    otherwise ``refusals`` says why and the current skill goes on. Between two policies the targets blend.
+    otherwise ``refusals`` says why and the current skill goes on. Between two policies the targets blend, but for the legs'.
     """
 
     gain_time = 0.6  # s for the gains to rise
@@ -98,6 +109,7 @@ class SkillPlayer:
         self._engaged = 0.0
         self._from = np.zeros(n)
         self._blend_from = np.zeros(n)
+        self._blended = blended(config)
         self._blend_start = -np.inf
 
     @property
@@ -195,7 +207,7 @@ class SkillPlayer:
         c.kd[:] = plan.kd
         w = (now - self._blend_start) / self.blend_time
         if w < 1.0:
-            c.joint_pos[:] = self._blend_from + w * (c.joint_pos - self._blend_from)
+            c.joint_pos[:] = blend(c.joint_pos, self._blend_from, w, self._blended)
         if "skill_value" in outputs:
             first = self.skill - k
             self.values[first : first + len(policy.contract.skills)] = outputs["skill_value"]

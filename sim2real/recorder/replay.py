@@ -21,7 +21,7 @@ from sim2real.recorder.run import Run, rule_name
 from sim2real.recorder.summary import mode_name
 from sim2real.records import Calls, command_view, state_view
 from sim2real.safety import Limits, Safety
-from sim2real.skills import SkillPlayer, Stage
+from sim2real.skills import SkillPlayer, Stage, blend, blended
 from sim2real.types import Sim2realError
 
 COMMAND_FIELDS = ("joint_pos", "joint_vel", "joint_torque", "kp", "kd")
@@ -142,6 +142,7 @@ def _policy_changes(
     recorded, policies = _policies(run, robot, files)
     current, since = -1, -np.inf  # policy that runs; when the blend from another one's targets began
     before = blend_from = np.zeros(len(robot.joint_names))
+    parts = blended(robot)
     first_label = np.cumsum([0, *(len(contract.skills) for contract in recorded)])
     for row, time in zip(run.pilot, run.pilot_time.tolist(), strict=True):
         index = int(row["policy"]) if row["stage"] == Stage.RUN else -1
@@ -163,7 +164,7 @@ def _policy_changes(
                 wanted = outputs["joint_pos_target"].astype(float)
                 share = (now - since) / SkillPlayer.blend_time
                 if share < 1.0:
-                    wanted = blend_from[joints] + share * (wanted - blend_from[joints])
+                    wanted = blend(wanted, blend_from[joints], share, parts[joints])
                 names = contract.target_joint_names
                 yield from _difference(time, "joint_pos_target", names, target[joints], wanted, tolerance)
                 if "skill_value" in outputs:

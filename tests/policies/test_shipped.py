@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from policies.basics import MOTIONS, Basics
@@ -12,7 +13,9 @@ from policies.card import steps
 from policies.evaluate import FileActor, random_script, run_episodes
 from policies.through_bytes import deploy_episode, stayed_up
 from sim2real.config import load_robot
+from sim2real.operators.script import ScriptOperator, Step
 from sim2real.policy import load_policy
+from sim2real.simulation import Scene, Simulation
 
 ROBOT = load_robot("g1")
 FILE = Path(__file__).resolve().parents[2] / ROBOT.policies["basics"].file
@@ -35,6 +38,31 @@ def test_the_card_is_about_this_file():
     report = json.loads(FILE.with_suffix(".json").read_text())
     assert digest in FILE.with_suffix(".md").read_text() and report["sha256"] == digest
     assert set(report["calm"]) == set(MOTIONS) and len(report["switches"]) == len(MOTIONS) * (len(MOTIONS) - 1)
+
+
+@pytest.mark.parametrize("name", ["ball", "pickup"])
+def test_the_cards_of_ball_skills_are_about_their_files(name):
+    file = FILE.with_name(f"{name}.onnx")
+    policy, report = load_policy(file, trial=0), json.loads(file.with_suffix(".json").read_text())
+    assert policy.sha256 in file.with_suffix(".md").read_text() and report["sha256"] == policy.sha256
+    assert set(report["camera"]) == set(report["training"]) == set(policy.contract.skill_labels)
+
+
+@pytest.mark.slow
+def test_a_ball_is_thrown_another_is_picked_up_and_held_through_the_bytes():
+    policies = [load_policy(FILE.with_name(f"{name}.onnx"), ROBOT, trial=0) for name in ("ball", "pickup")]
+    dwell = policies[1].contract.skills[0].dwell
+    assert dwell > 7  # no other skill begins from down there
+    seen = []
+    script = [Step("hold", 1.0), Step("pass", 3.0), Step("pickup", 1.0), Step("hold", dwell + 1.0)]
+    run = Simulation(ROBOT, policies, ScriptOperator(script), Scene(), each_tick=lambda s: seen.append(s.world.truth()))
+    summary = run.run()
+    height = np.array([t.position_object_in_world[2] for t in seen])
+    base = np.array([t.position_base_in_world[2] for t in seen])
+    assert not summary.fell and not summary.faults, summary
+    assert base.min() < 0.4 and height[base.argmin()] < 0.12
+    held = next(t for t in reversed(seen) if t.position_base_in_world[2] > 0.75)  # before it is damped
+    assert np.linalg.norm(held.position_object_in_world - held.position_base_in_world) < 0.4
 
 
 @pytest.mark.slow

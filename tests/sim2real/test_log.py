@@ -425,10 +425,12 @@ def test_two_policies_replay_through_their_blends(tmp_path):
     def value(tick, pilot):
         pilot["skill_value"][np.flatnonzero(pilot["skill"] == 1)[5], 1] += 0.5
 
-    def blended(tick, pilot):
-        pilot["command.joint_pos"][np.flatnonzero(pilot["skill"] == 1)[5], 0] += 0.01
+    arm = run.joints.index("left_elbow_joint")
 
-    for change, what, where in ((value, "skill_value", "lean"), (blended, "joint_pos_target", run.joints[0])):
+    def blended(tick, pilot):
+        pilot["command.joint_pos"][np.flatnonzero(pilot["skill"] == 1)[5], arm] += 0.01
+
+    for change, what, where in ((value, "skill_value", "lean"), (blended, "joint_pos_target", run.joints[arm])):
         (found,) = replay(Run(altered(path, tmp_path, change))).first
         assert (found.what, found.where) == (what, where)
         (tmp_path / "altered.mcap").unlink()
