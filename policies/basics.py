@@ -95,7 +95,7 @@ class Basics:
     balance_damping: float = 0.25  # rad per rad/s
     # The same for who has gone down, where legs are soft and cannot step; in full at BOWED. Rad per rad of roll, and per
     # rad/s, by which one leg bends and the other stretches, and hips roll; rad of hips per rad of pitch; and rad that joints
-    # are sent further. Found by CMA-ES; any one of the first three alone would do nearly as well.
+    # are sent further. Found by CMA-ES; without one of the first three the others do nearly as well.
     bow_legs: tuple[float, float] = (1.7, 0.04)
     bow_hips: tuple[float, float] = (-1.8, -0.09)
     bow_pitch: float = 0.7

@@ -221,11 +221,14 @@ class Env(VecEnv):
         busy = (rng.random(k) < config.busy) & ~goes
         self.pose[ids] = _tensor(pose * busy[:, None] * self._difficulty)
         self._busy_in[ids] = self._ticks(config.busy_every, k)
-        self._down_goal[ids] = goes * np.clip(rng.uniform(-0.4, 1.4, k), 0, 1)
-        self._down_speed[ids] = config.period / rng.uniform(*config.down_in, k)
+        if goes.any():
+            self._down_goal[ids] = goes * np.clip(rng.uniform(-0.4, 1.4, k), 0, 1)
+            self._down_speed[ids] = config.period / rng.uniform(*config.down_in, k)
 
     def _reaching(self) -> Tensor:
         """(envs, n) rad, what the way to the floor adds to the pose."""
+        if not self._down.any():
+            return torch.zeros_like(self.pose)
         return _tensor(down(self.graph.joint_names, self._down))
 
     @property
@@ -246,9 +249,10 @@ class Env(VecEnv):
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         home = np.full(k, True) if self.script is not None else rng.random(k) < config.home_start
         label = self.script[ids, 0] if self.script is not None else rng.integers(labels, size=k)
-        self._goes_down[ids] = goes = (self.script is None) & (rng.random(k) < config.down)
-        label = np.where(goes, self.graph.labels.index("stand"), label)
-        self._down[ids] = goes * ~home * rng.random(k)
+        if config.down and self.script is None:
+            self._goes_down[ids] = goes = rng.random(k) < config.down
+            label = np.where(goes, self.graph.labels.index("stand"), label)
+            self._down[ids] = goes * ~home * rng.random(k)
         skill, phase = one_hot(label, labels), _tensor(rng.random((k, 1)))
         at_home = torch.from_numpy(home)[:, None]
         pose = torch.where(at_home, self.graph.home, self.graph.references.goal(skill, phase)) + self._reaching()[ids]

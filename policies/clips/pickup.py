@@ -25,6 +25,7 @@ from policies.physics import Stature
 FACING = {"left": np.pi / 2, "right": -np.pi / 2}  # rad about x: palms that look at each other
 UPRIGHT = 0.03  # m/rad, what a turned hand counts beside one that is elsewhere
 SMOOTHING = 2.0  # frames
+SETTLING = 5  # frames before the first: then inverse kinematics has forgotten where it began
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,7 @@ class Pickup:
     open: float = 0.06  # m between each palm and the ball before they close
     palms: float = 0.12  # m above the floor: a hand that points down reaches below the middle of the ball
     hold: tuple[float, float, float] = (0.25, 0.0, 0.04)  # m in the base, where the ball ends
-    fingers: tuple[float, float] = (
-        0.45,
-        0.2,
-    )  # rad that they point down from ahead in the base: at the floor, and at the end
+    fingers: tuple[float, float] = (0.45, 0.2)  # rad down from ahead in the base: at the floor, and at the end
 
     @property
     def seconds(self) -> float:
@@ -86,8 +84,7 @@ def pickup(body: RobotBody, name: str, motion: Pickup = Pickup(), fps: float = 1
             back = turn.apply(np.array([0.0, 0.0, touch + path.apart[t]]))
             palms[side] = bases[t] @ mink.SE3.from_rotation_and_translation(turn, there + (1 - u) * over - back)
         frames.append(Frame(base[t], pose[t], palms))
-    frames = [frames[0]] * 5 + frames  # by then inverse kinematics has forgotten where it began
-    joint_pos = smooth(follow(body, frames, UPRIGHT)[5:], SMOOTHING)
+    joint_pos = smooth(follow(body, frames[:1] * SETTLING + frames, UPRIGHT)[SETTLING:], SMOOTHING)
     header = Header(
         name=name, skill=name.rsplit("_", 1)[0], body=robot.name, fps=fps, joint_names=robot.joint_names,
         point_names=POINT_NAMES, ball_radius=radius, source="policies/clips/pickup.py", licence="Apache-2.0",
