@@ -16,7 +16,7 @@ from policies.export import envelope, export
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.plan import samples
+from policies.skillmimic.plan import SETTLE, samples
 from policies.skillmimic.starts import approach, first_clips, object_start, start_posture
 from policies.skillmimic.train import load_graph
 from policies.training import git_revision
@@ -27,6 +27,7 @@ from sim2real.types import Sim2realError
 SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "walks", "bends", "corrections", "timed", "period",
             "timestep", "action_ratio", "action_max", "grip", "balance_gain", "balance_damping", "position_margin",
             "history", "frames", "throw", "placed", "terminations")  # fmt: skip
+ARMS_COME = 1.0  # s, at most, until arms are where a clip begins
 SHOWN, NONE = (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)  # m/s, m/s, rad/s: commands of a timeline that names none
 GOLDEN_STEPS, GOLDEN = 40, 4  # ticks of each golden sequence, and how many
 
@@ -69,8 +70,7 @@ def export_graph(
             {
                 "label": label,
                 "description": f"{label}, {origin(graph, clip)}",
-                # who is down goes through with it: from there no other skill begins
-                "dwell": graph.clips.seconds(clip) if label in config.bends else Skill.model_fields["dwell"].default,
+                "dwell": dwell(graph, clip) if label in config.bends else Skill.model_fields["dwell"].default,
                 "velocity": SHOWN if label in config.walks else NONE,
                 "object": object_start(graph, clip),
             }
@@ -97,6 +97,12 @@ def export_graph(
         },
     }
     return export(graph, path, fields=fields, sequences=sequences)
+
+
+def dwell(graph: PolicyGraph, clip: int) -> float:
+    """s that clip number ``clip`` takes, with what comes before: who is down goes through with it, for no other skill begins
+    from there."""
+    return graph.clips.seconds(clip) + SETTLE * graph.config.period + ARMS_COME
 
 
 def origin(graph: PolicyGraph, clip: int) -> str:

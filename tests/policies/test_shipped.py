@@ -55,7 +55,7 @@ def test_a_ball_is_thrown_another_is_picked_up_and_held_through_the_bytes():
     dwell = pickup.dwell
     assert pickup.description == "pickup, by formula" and dwell > 7  # no other skill begins from down there
     seen = []
-    script = [Step("hold", 1.0), Step("pass", 3.0), Step("pickup", 1.0), Step("hold", dwell + 1.0)]
+    script = [Step("hold", 2.0), Step("pass", 4.0), Step("pickup", 1.0), Step("hold", dwell + 1.0)]
     run = Simulation(
         ROBOT, policies, ScriptOperator(script), Scene(), each_tick=lambda s: seen.append((s.since, s.world.truth()))
     )
