@@ -16,7 +16,7 @@ from policies.skillmimic.curves import PAPER, Curve, learned, read, svg
 from policies.skillmimic.evaluate import BALL_NEAR, BODY_NEAR, Result, evaluate_skill, result, rule_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.release import graph_of
-from policies.skillmimic.tables import FIRST, NOMINAL, REST, SECOND, sweeps, switches
+from policies.skillmimic.tables import CELLS, FIRST, NOMINAL, REST, SECOND, pairs, sweep, switched
 from policies.skillmimic.through_bytes import BEFORE, graph_in, judged
 from policies.spread import spread
 from sim2real.contract import Contract
@@ -96,18 +96,30 @@ def evaluate(
     if not tables:
         return Evaluation(policy.sha256, results)
     each = max(1, min(CELL, episodes // 5))
-    actor = BallActor(path, each)
-    return Evaluation(
-        policy.sha256,
-        results,
-        sweeps(graph, each, SECONDS, actor, tell),
-        switches(graph, each, actor, tell),
-    )
+    tell(f"other balls, {each} episodes a cell")
+    balls = spread(with_balls, [(path, label, each) for label in graph.labels])
+    tell(f"one skill after another, {each} episodes a pair")
+    switches = pairs(graph)
+    shares = spread(one_after_another, [(path, *pair, each) for pair in switches])
+    rates = {
+        f"{a} > {b}": Rate(round(float(s.sum())), len(s)) for (a, b), s in zip(switches, shares, strict=True) if len(s)
+    }
+    return Evaluation(policy.sha256, results, dict(zip(graph.labels, balls, strict=True)), rates)
 
 
 def in_training(path: Path, label: str, episodes: int) -> Result:
     """``episodes`` of one skill of a policy file in training's world."""
     return evaluate_skill(graph_in(path), label, episodes, SECONDS, seed=1, act=BallActor(path, episodes))
+
+
+def with_balls(path: Path, label: str, each: int) -> dict[str, Rate]:
+    """A skill of a policy file with other balls, ``each`` episodes a cell."""
+    return sweep(graph_in(path), label, each, SECONDS, BallActor(path, each * len(CELLS)))
+
+
+def one_after_another(path: Path, first: str, second: str, each: int) -> np.ndarray:
+    """Success of a policy file's ``second`` skill after its ``first``, of ``each`` episodes."""
+    return switched(graph_in(path), first, second, each, BallActor(path, each))
 
 
 def through_bytes(

@@ -14,7 +14,6 @@ from torch import Tensor
 from policies.evaluate import UNSEEN, Rate
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.randomisation import TABLE
 from policies.skillmimic.rewards import Step
 from policies.skillmimic.starts import aiming
 
@@ -178,13 +177,27 @@ def evaluate_skill(
     push: float = 0.0,
     seed: int = 0,
     act: Callable[[Env], Tensor] | None = None,
-    fixed: Mapping[str, float] | None = None,
 ) -> Result:
-    """As ``evaluate``, of one skill. ``fixed``: terms of the randomisation that have one value instead."""
+    """As ``evaluate``, of one skill."""
+    return result(*performed(graph, skill, episodes, seconds, push, seed, act))
+
+
+def performed(
+    graph: PolicyGraph,
+    skill: str,
+    episodes: int,
+    seconds: float,
+    push: float = 0.0,
+    seed: int = 0,
+    act: Callable[[Env], Tensor] | None = None,
+    fixed: Mapping[str, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Success (episodes,) in [0, 1] by the skill's rule, and sums (episodes, 4) of Measures over frames (episodes,).
+    ``fixed``: of terms of the randomisation what they are in each episode (episodes,); NaN: drawn, as ever."""
     env = episodes_of(graph, skill, episodes, seconds, push, seed)
     config = env.config
     if fixed:
-        env.random.table = TABLE | {name: TABLE[name]._replace(low=x, high=x) for name, x in fixed.items()}
+        env.random.fixed = dict(fixed)
         env.reset()
         env.episode_length_buf[:] = 0
     act = act or (lambda e: graph.actor(e.observation))
@@ -205,7 +218,7 @@ def evaluate_skill(
         succeeded(skill, Trace(*(x[:end, n] for x in everything)), config.period, ticks[clips[n]])
         for n, end in enumerate(frames)
     ]
-    return result(np.array(shares), sums, frames)
+    return np.array(shares), sums, frames
 
 
 def episodes_of(graph: PolicyGraph, skill: str, episodes: int, seconds: float, push: float = 0.0, seed: int = 0) -> Env:

@@ -88,10 +88,12 @@ EXPANDED = ("geom_friction", "body_mass", "body_inertia", "body_ipos", "actuator
 
 
 class Randomisation:
-    """Draws the table for the simulations of a batch. ``drawn[name]``: (sims, size). ``table`` may be changed between draws."""
+    """Draws the table for the simulations of a batch. ``drawn[name]``: (sims, size). ``table`` may be changed between draws,
+    and ``fixed[name]`` (sims,) is what a term is instead, where it is not NaN."""
 
     def __init__(self, batch: Batch, model: mujoco.MjModel) -> None:
         self.table = TABLE
+        self.fixed: dict[str, np.ndarray] = {}
         self._batch, self._model = batch, model
         self._fields = {field: batch.expand(field) for field in EXPANDED}
         sizes = {"joints": model.nu, "bodies": model.nbody}
@@ -102,6 +104,9 @@ class Randomisation:
         """New robots, balls and trackers in the simulations ``ids`` (k,)."""
         for name, term in self.table.items():
             x = rng.uniform(term.low, term.high, (len(ids), self._sizes[name]))
+            if name in self.fixed:
+                given = self.fixed[name][ids, None]
+                x = np.where(np.isnan(given), x, given)
             self.drawn[name][ids] = x
             if term.apply:
                 term.apply(self._fields, self._model, ids, x)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -14,7 +13,7 @@ from policies.clips.library import robot_clips
 from policies.evaluate import Rate
 from policies.graph import one_hot
 from policies.skillmimic.env import Env
-from policies.skillmimic.evaluate import Trace, episodes_of, evaluate_skill, succeeded, ticks_of, traced
+from policies.skillmimic.evaluate import Trace, episodes_of, performed, succeeded, ticks_of, traced
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.starts import aiming
 
@@ -28,7 +27,6 @@ NOMINAL = f"{RADIUS:g} m, {MASS:g} kg, restitution {RESTITUTION:g}"
 FIRST, SECOND, REST = 2.0, 5.0, 0.5  # s of the first skill (or its clip and REST), and of the second
 
 Act = Callable[[Env], Tensor]
-Tell = Callable[[str], None]
 
 
 def fixed(what: str, factor: float) -> dict[str, float]:
@@ -41,15 +39,20 @@ def fixed(what: str, factor: float) -> dict[str, float]:
     }[what]
 
 
-def sweeps(graph: PolicyGraph, episodes: int, seconds: float, act: Act, tell: Tell) -> dict[str, dict[str, Rate]]:
-    """Table 2: skill -> "radius x 0.5" -> success."""
-    found: dict[str, dict[str, Rate]] = {label: {} for label in graph.labels}
-    for label, (what, factors) in itertools.product(graph.labels, SWEEPS.items()):
-        tell(f"{label}: {what} of the ball x {', '.join(f'{f:g}' for f in factors)}")
-        for factor in factors:
-            r = evaluate_skill(graph, label, episodes, seconds, seed=2, act=act, fixed=fixed(what, factor))
-            found[label][f"{what} x {factor:g}"] = r.success
-    return found
+CELLS = [(what, factor) for what, factors in SWEEPS.items() for factor in factors]
+
+
+def sweep(graph: PolicyGraph, label: str, episodes: int, seconds: float, act: Act) -> dict[str, Rate]:
+    """Table 2 of one skill: "radius x 0.5" -> success over ``episodes``, all side by side in one environment of
+    ``len(CELLS) * episodes`` robots."""
+    terms = {name: np.full((len(CELLS), episodes), np.nan) for what in SWEEPS for name in fixed(what, 1.0)}
+    for k, (what, factor) in enumerate(CELLS):
+        for name, value in fixed(what, factor).items():
+            terms[name][k] = value
+    balls = {name: values.ravel() for name, values in terms.items()}
+    shares, _, _ = performed(graph, label, len(CELLS) * episodes, seconds, seed=2, act=act, fixed=balls)
+    good = shares.reshape(len(CELLS), episodes).sum(axis=1)
+    return {f"{what} x {f:g}": Rate(round(float(n)), episodes) for (what, f), n in zip(CELLS, good, strict=True)}
 
 
 def pairs(graph: PolicyGraph) -> list[tuple[str, str]]:
@@ -64,19 +67,8 @@ def pairs(graph: PolicyGraph) -> list[tuple[str, str]]:
     return [(a, b) for a in ends for b in begins if a != b]
 
 
-def switches(graph: PolicyGraph, episodes: int, act: Act, tell: Tell) -> dict[str, Rate]:
-    """Table 3, right half: "first > second" -> success of the second, by its rule, of the robots that came so far."""
-    found = {}
-    for first, second in pairs(graph):
-        tell(f"{first} > {second}")
-        shares = switched(graph, first, second, episodes, act)
-        if len(shares):
-            found[f"{first} > {second}"] = Rate(round(float(shares.sum())), len(shares))
-    return found
-
-
 def switched(graph: PolicyGraph, first: str, second: str, episodes: int, act: Act) -> np.ndarray:
-    """Success (k,) in [0, 1] of ``second`` in the episodes that came through ``first``."""
+    """Table 3, right half: success (k,) in [0, 1] of ``second``, by its rule, in the episodes that came through ``first``."""
     clips, config = graph.clips, graph.config
     env = episodes_of(graph, first, episodes, 2 * (FIRST + SECOND), seed=3)
     nexts = env.rng.choice(np.flatnonzero(clips.skill == graph.labels.index(second)), episodes)

@@ -15,9 +15,9 @@ from policies.skillmimic import tables
 from policies.skillmimic.card import Evaluation, card, rule
 from policies.skillmimic.config import TASKS
 from policies.skillmimic.curves import learned, read, svg
-from policies.skillmimic.evaluate import Result, evaluate_skill
+from policies.skillmimic.evaluate import Result, performed
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.tables import fixed, pairs, switched
+from policies.skillmimic.tables import CELLS, fixed, pairs, sweep, switched
 from sim2real.cli.eval import main
 from sim2real.contract import Contract
 from sim2real.policy import read_contract
@@ -49,6 +49,27 @@ def test_a_larger_ball_of_the_same_density_is_heavier():
     assert max(tables.SWEEPS["restitution"]) * 0.8 < 1
 
 
+def alike(what: str, factor: float) -> dict[str, np.ndarray]:
+    return {name: np.full(3, x) for name, x in fixed(what, factor).items()}
+
+
+def test_every_cell_has_its_own_balls_and_draws_the_rest(graph):
+    seen = []
+
+    def look(env):
+        seen.append({n: env.random.drawn[n][:, 0].reshape(len(CELLS), 2).copy() for n in ("ball_radius", "ball_mass")})
+        return still(env)
+
+    found = sweep(graph, "hold", 2, 0.04, look)
+    assert list(found) == [f"{what} x {factor:g}" for what, factor in CELLS]
+    assert all(r.episodes == 2 and 0 <= r.survived <= 2 for r in found.values())
+    radius, mass = (seen[0][n] for n in ("ball_radius", "ball_mass"))
+    assert (radius[CELLS.index(("radius", 1.5))] == 1.5).all() and (mass[CELLS.index(("radius", 1.5))] == 1.5**3).all()
+    heavy, dead = CELLS.index(("density", 4.0)), CELLS.index(("restitution", 0.6))
+    assert (mass[heavy] == 4.0).all() and len(set(radius[heavy])) == 2
+    assert len(set(mass[dead])) == 2 and (np.abs(mass[dead] - 1) < 0.2).all()
+
+
 def test_a_swept_ball_is_the_same_in_every_robot_and_the_rest_differs(graph):
     seen = []
 
@@ -57,10 +78,10 @@ def test_a_swept_ball_is_the_same_in_every_robot_and_the_rest_differs(graph):
         seen.append((env.random._fields["geom_size"][:, ball, 0].copy(), env.random.drawn["ball_mass"].copy()))
         return still(env)
 
-    evaluate_skill(graph, "hold", 3, 0.04, act=look, fixed=fixed("density", 2.0))
+    performed(graph, "hold", 3, 0.04, act=look, fixed=alike("density", 2.0))
     radius, mass = seen[0]
     assert (mass == 2.0).all() and len(np.unique(radius)) == 3
-    evaluate_skill(graph, "hold", 3, 0.04, act=look, fixed=fixed("radius", 1.3))
+    performed(graph, "hold", 3, 0.04, act=look, fixed=alike("radius", 1.3))
     np.testing.assert_allclose(seen[-1][0], 1.3 * 0.09)
 
 
