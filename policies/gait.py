@@ -87,8 +87,7 @@ class Gait(nn.Module):
         self.period = period
         n = len(joint_names)
         loads = torch.zeros(2, n) if loads is None else torch.tensor(loads).float()
-        legs = [[_row(joint_names, side, PARTS[part]) for side in ("left", "right")] for part in PARTS]
-        of = dict(zip(PARTS, torch.tensor(legs), strict=True))  # part: (2, n), the left leg's and the right one's
+        of = {part: torch.tensor(legs(joint_names, part)) for part in PARTS}
         self.lines: Tensor  # (n, 4)
         self.register_buffer("lines", torch.cat([of[part] for part in MEASURED]).T.contiguous())
         self.basis: Tensor  # (2 parts + 1 + 2, n): what steps do, by leg; both legs aside; what one leg bears
@@ -190,10 +189,10 @@ class Gait(nn.Module):
         return torch.cat(shares, dim=-1) @ self.basis
 
 
-def _row(joint_names: Sequence[str], side: str, parts: dict[str, float]) -> list[float]:
-    """A share for each joint: those of ``parts`` in the leg on ``side``."""
-    shares = {f"{side}_{part}_joint": share for part, share in parts.items()}
-    return [shares.get(name, 0.0) for name in joint_names]
+def legs(joint_names: Sequence[str], part: str) -> list[list[float]]:
+    """(2, n): a share for each joint of what ``part`` of PARTS does to the left leg, and to the right one."""
+    shares = [{f"{side}_{joint}_joint": x for joint, x in PARTS[part].items()} for side in ("left", "right")]
+    return [[leg.get(name, 0.0) for name in joint_names] for leg in shares]
 
 
 def single_loads(model: mujoco.MjModel, pose: np.ndarray, kp: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from policies.basics import BOWED, MOTIONS, Basics
-from policies.gait import Gait, single_loads
+from policies.gait import Gait, legs, single_loads
 from policies.observations import Signals, gravity_in_base, observe, pitched
 from policies.references import References
 from sim2real.config import RobotConfig, load_robot
@@ -204,21 +204,19 @@ class PolicyGraph(nn.Module):
 
 def bowing(joint_names: Sequence[str], config: Basics) -> np.ndarray:
     """(4, n): rad of the joints per rad of roll, per rad/s of it, per rad of pitch, and always, of a robot that is down."""
-    found = np.zeros((4, len(joint_names)))
-    (legs, legs_rate), (hips, hips_rate) = config.bow_legs, config.bow_hips
-    for k, name in enumerate(joint_names):
-        side = 1.0 if name.startswith("left") else -1.0
-        part = name.removeprefix("left_").removeprefix("right_").removesuffix("_joint")
-        bend = side * {"hip_pitch": -1.0, "knee": 2.0, "ankle_pitch": -1.0}.get(part, 0.0)
-        roll = float(part == "hip_roll")
-        parts = ("hip_pitch", "knee", "ankle_pitch", "waist_pitch")
-        found[:, k] = (
-            legs * bend + hips * roll,
-            legs_rate * bend + hips_rate * roll,
-            config.bow_pitch * (part == "hip_pitch"),
-            dict(zip(parts, config.bow_lean, strict=True)).get(part, 0.0),
-        )
-    return found
+    bend, roll, pitch = (np.array(legs(joint_names, part)) for part in ("raise", "roll", "pitch"))
+    (bends, bends_rate), (rolls, rolls_rate) = config.bow_legs, config.bow_hips
+    apart, aside = bend[0] - bend[1], roll.sum(axis=0)
+    leans = dict(zip(("hip_pitch", "knee", "ankle_pitch", "waist_pitch"), config.bow_lean, strict=True))
+    lean = [sum(x for part, x in leans.items() if name.endswith(f"{part}_joint")) for name in joint_names]
+    return np.stack(
+        [
+            bends * apart + rolls * aside,
+            bends_rate * apart + rolls_rate * aside,
+            config.bow_pitch * pitch.sum(axis=0),
+            np.array(lean),
+        ]
+    )
 
 
 def one_hot(labels: Sequence[int] | np.ndarray, size: int) -> Tensor:

@@ -22,10 +22,10 @@ import mink
 import numpy as np
 
 from policies import ball
-from policies.clips.format import Clip, Header
+from policies.clips.format import Clip
 from policies.clips.kinematics import smooth
-from policies.clips.reach import Frame, follow, points
-from policies.clips.robot import POINT_NAMES, SIDES, RobotBody
+from policies.clips.reach import Frame, clip_of, follow
+from policies.clips.robot import SIDES, RobotBody
 from policies.physics import standing_height
 
 GRAVITY = 9.81  # m/s^2
@@ -237,17 +237,6 @@ def _clip(
     joint_pos = smooth(follow(body, frames, turned), SMOOTHING)[last]
     base = np.tile(base, (count, 1))
     hands = path.on[last, None] & np.array([s in facing for s in SIDES])
-    header = Header(
-        name=name, skill=name.rsplit("_", 1)[0], body=body.robot.name, fps=fps, joint_names=names,
-        point_names=POINT_NAMES, ball_radius=radius, source=f"policies/clips/bounce.py, {source}", licence="Apache-2.0",
-    )  # fmt: skip
-    return Clip(
-        header,
-        base_position_in_world=base[:, :3],
-        base_orientation_in_world=base[:, 3:],
-        joint_pos=joint_pos,
-        points_in_world=points(body, base, joint_pos),
-        ball_position_in_world=np.column_stack([np.tile(place, (count, 1)), path.ball[last]]),
-        ball_velocity_in_world=np.column_stack([np.zeros((count, 2)), path.velocity[last]]),
-        contact=np.column_stack([hands, np.ones((count, 2), bool)]),
-    )
+    where = np.column_stack([np.tile(place, (count, 1)), path.ball[last]])
+    velocity = np.column_stack([np.zeros((count, 2)), path.velocity[last]])
+    return clip_of(body, name, f"policies/clips/bounce.py, {source}", fps, base, joint_pos, where, velocity, hands)

@@ -16,10 +16,10 @@ import numpy as np
 from policies import ball
 from policies.basics import down
 from policies.clips.bounce import eased
-from policies.clips.format import Clip, Header
+from policies.clips.format import Clip
 from policies.clips.kinematics import rate, smooth
-from policies.clips.reach import Frame, follow, points
-from policies.clips.robot import POINT_NAMES, SIDES, RobotBody
+from policies.clips.reach import Frame, clip_of, follow
+from policies.clips.robot import SIDES, RobotBody
 from policies.physics import Stature
 
 FACING = {"left": np.pi / 2, "right": -np.pi / 2}  # rad about x: palms that look at each other
@@ -85,20 +85,8 @@ def pickup(body: RobotBody, name: str, motion: Pickup = Pickup(), fps: float = 1
             palms[side] = bases[t] @ mink.SE3.from_rotation_and_translation(turn, there + (1 - u) * over - back)
         frames.append(Frame(base[t], pose[t], palms))
     joint_pos = smooth(follow(body, frames[:1] * SETTLING + frames, UPRIGHT)[SETTLING:], SMOOTHING)
-    header = Header(
-        name=name, skill=name.rsplit("_", 1)[0], body=robot.name, fps=fps, joint_names=robot.joint_names,
-        point_names=POINT_NAMES, ball_radius=radius, source="policies/clips/pickup.py", licence="Apache-2.0",
-    )  # fmt: skip
-    return Clip(
-        header,
-        base_position_in_world=base[:, :3],
-        base_orientation_in_world=base[:, 3:],
-        joint_pos=joint_pos,
-        points_in_world=points(body, base, joint_pos),
-        ball_position_in_world=place,
-        ball_velocity_in_world=rate(place, fps),
-        contact=np.column_stack([path.on, path.on, np.ones((len(place), 2), bool)]),
-    )
+    hands = np.column_stack([path.on, path.on])
+    return clip_of(body, name, "policies/clips/pickup.py", fps, base, joint_pos, place, rate(place, fps), hands)
 
 
 def _standing(body: RobotBody, pose: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Arms that bring palms where a formula has them, by inverse kinematics; what else moves is the formula's."""
+"""Clips by formula: arms bring palms where it has them, by inverse kinematics; what else moves is the formula's."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import mink
 import mujoco
 import numpy as np
 
-from policies.clips.robot import RobotBody
+from policies import ball
+from policies.clips.format import Clip, Header
+from policies.clips.robot import POINT_NAMES, RobotBody
 
 SOLVER = "daqp"
 
@@ -59,6 +61,35 @@ def follow(body: RobotBody, frames: Iterable[Frame], turned: float) -> np.ndarra
             configuration.integrate_inplace(speed, 0.1)
         rows.append(configuration.q[body.qpos_at].copy())
     return np.array(rows)
+
+
+def clip_of(
+    body: RobotBody,
+    name: str,
+    source: str,
+    fps: float,
+    base: np.ndarray,
+    joint_pos: np.ndarray,
+    ball_position: np.ndarray,
+    ball_velocity: np.ndarray,
+    hands: np.ndarray,
+) -> Clip:
+    """A robot's clip by formula, with both feet on the floor: bases (T, 7), joints (T, n) rad, the ball's positions (T, 3) m
+    and velocities (T, 3) m/s in the world, and which ``hands`` (T, 2) touch it."""
+    header = Header(
+        name=name, skill=name.rsplit("_", 1)[0], body=body.robot.name, fps=fps, joint_names=body.robot.joint_names,
+        point_names=POINT_NAMES, ball_radius=ball.RADIUS, source=source, licence="Apache-2.0",
+    )  # fmt: skip
+    return Clip(
+        header,
+        base_position_in_world=base[:, :3],
+        base_orientation_in_world=base[:, 3:],
+        joint_pos=joint_pos,
+        points_in_world=points(body, base, joint_pos),
+        ball_position_in_world=ball_position,
+        ball_velocity_in_world=ball_velocity,
+        contact=np.column_stack([hands, np.ones((len(base), 2), bool)]),
+    )
 
 
 def points(body: RobotBody, base: np.ndarray, joint_pos: np.ndarray) -> np.ndarray:

@@ -63,6 +63,7 @@ class ReferenceClips:
             labels += [k] * len(found)
         for clip in clips:
             _check(clip, body)
+        self.recorded = list(clips)  # as they are in their files
         if crouch is not None:
             for k, skill in enumerate(config.skills):
                 mine = [i for i, label in enumerate(labels) if label == k and skill not in config.bends]
@@ -131,6 +132,10 @@ class ReferenceClips:
             joint_vel=m.joint_vel * way[:, None],
             object_velocity=m.object_velocity * way[:, None],
         )
+
+    def of(self, skill: int) -> list[Clip]:
+        """A skill's clips, as they are in their files."""
+        return [clip for clip, label in zip(self.recorded, self.skill, strict=True) if label == skill]
 
     def seconds(self, clip: int) -> float:
         """How long clip number ``clip`` lasts."""

@@ -132,7 +132,7 @@ class Plan(nn.Module):
     def performed(self, skill: Tensor, last_skill: Tensor, last_clock: Tensor, ball: Tensor) -> Tensor:
         """The skill (N, labels) of this tick where ``skill`` is asked for: one whose ball is in the air goes on until that is
         back, unless it is lost."""
-        row = (last_skill @ self.first + torch.clamp(torch.floor(last_clock), min=0.0))[:, 0].to(torch.int64)
+        row = self._row(last_skill, last_clock)
         off = ball[:, :3] - self.table[row][:, self.arms : self.arms + 3]
         near = (off * off).sum(dim=-1, keepdim=True) < LOST**2
         stays = last_skill.sum(dim=-1, keepdim=True) * self.away[row] * near.to(ball.dtype)
@@ -153,9 +153,8 @@ class Plan(nn.Module):
         same = (skill * last_skill).sum(dim=-1, keepdim=True)
         last, loop, ready = skill @ self.last, skill @ self.loop, skill @ self.ready
         clock, rate = self._step(skill, same * last_clock, same, last, loop, ball, calm)
-        here = torch.clamp(torch.floor(clock), min=0.0)
-        share = torch.clamp(clock, min=0.0) - here
-        row = (skill @ self.first + here)[:, 0].to(torch.int64)
+        share = torch.clamp(clock, min=0.0) - torch.clamp(torch.floor(clock), min=0.0)
+        row = self._row(skill, clock)
         following = self.following[row]
         mixed = lambda t: t[row] + share * (t[following] - t[row])  # noqa: E731
         planned = mixed(self.table)
@@ -175,6 +174,10 @@ class Plan(nn.Module):
         target = last_target + torch.minimum(torch.maximum(target - last_target, -step), step)
         return Planned(target, mixed(self.poses), clock, error)
 
+    def _row(self, skill: Tensor, clock: Tensor) -> Tensor:
+        """(N,) rows of the tables at a skill's ``clock`` (N, 1); its first before that has begun."""
+        return (skill @ self.first + torch.clamp(torch.floor(clock), min=0.0))[:, 0].to(torch.int64)
+
     def _step(
         self, skill: Tensor, clock: Tensor, same: Tensor, last: Tensor, loop: Tensor, ball: Tensor, calm: Tensor
     ) -> tuple[Tensor, Tensor]:
@@ -183,7 +186,7 @@ class Plan(nn.Module):
         A ball that is caught is where the plan has it, sooner or later. One that bounces may never get that high; its
         velocity tells the time, and that jumps back by ``bounce`` s on the floor.
         """
-        row = (skill @ self.first + torch.clamp(torch.floor(clock), min=0.0))[:, 0].to(torch.int64)
+        row = self._row(skill, clock)
         planned = self.table[row][:, self.arms :]
         velocity = planned[:, 3:6]
         along = ((ball[:, :3] - planned[:, :3]) * velocity).sum(-1, keepdim=True)

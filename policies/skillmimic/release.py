@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from drivers.sim import ball
-from policies.clips.library import robot_clips
 from policies.evaluate import UNSEEN
 from policies.export import envelope, export
 from policies.skillmimic.config import SkillMimic
@@ -20,7 +19,7 @@ from policies.skillmimic.plan import SETTLE, samples
 from policies.skillmimic.starts import approach, first_clips, object_start, start_posture
 from policies.skillmimic.train import load_graph
 from policies.training import git_revision
-from sim2real.contract import Contract, Skill
+from sim2real.contract import Contract
 from sim2real.policy import Policy
 from sim2real.types import Sim2realError
 
@@ -70,7 +69,7 @@ def export_graph(
             {
                 "label": label,
                 "description": f"{label}, {origin(graph, clip)}",
-                "dwell": dwell(graph, clip) if label in config.bends else Skill.model_fields["dwell"].default,
+                **({"dwell": dwell(graph, clip)} if label in config.bends else {}),
                 "velocity": SHOWN if label in config.walks else NONE,
                 "object": object_start(graph, clip),
             }
@@ -107,12 +106,8 @@ def dwell(graph: PolicyGraph, clip: int) -> float:
 
 def origin(graph: PolicyGraph, clip: int) -> str:
     """Where clip number ``clip`` comes from."""
-    recorded = {c.name: c for c in robot_clips(graph.config.robot)}
-    return (
-        "by formula"
-        if recorded[graph.clips.names[clip]].header.source.startswith("policies/")
-        else "from retargeted clips"
-    )
+    made = graph.clips.recorded[clip].header.source.startswith("policies/")
+    return "by formula" if made else "from retargeted clips"
 
 
 def settings(config: SkillMimic) -> str:

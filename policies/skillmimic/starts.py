@@ -8,7 +8,6 @@ import numpy as np
 
 from drivers.sim import ball
 from policies.clips.kinematics import conjugate, quaternion_from_rotation_vector, rotate
-from policies.clips.library import robot_clips
 from policies.physics import standing_height
 from policies.skillmimic.clips import PRESS, grip
 from policies.skillmimic.graph import PolicyGraph
@@ -31,8 +30,7 @@ def object_start(graph: PolicyGraph, clip: int) -> dict[str, Any]:
     in the skill's posture. Else lying or flying, as in the first frame.
     """
     clips = graph.clips
-    recorded = {c.name: c for c in robot_clips(graph.config.robot, graph.labels[clips.skill[clip]])}
-    if recorded[clips.names[clip]].contact[0, :2].all():
+    if clips.recorded[clip].contact[0, :2].all():
         alike = np.flatnonzero(clips.skill == clips.skill[clip])
         return {"how": "held", "position": _rounded(np.mean([_in_hands(graph, c) for c in alike], axis=0))}
     m = clips.motion(clips.first[[clip]], np.ones(1))
@@ -78,9 +76,9 @@ def approach(graph: PolicyGraph) -> list[float]:
     empty where the first skill does not begin with both palms on the ball."""
     clips, body = graph.clips, graph.body
     postures = []
-    for clip in robot_clips(graph.config.robot, graph.labels[0]):
+    for clip in clips.of(0):
         both = clip.contact[:, :2].all(axis=1)
-        if clip.name not in clips.names or not both[0]:
+        if not both[0]:
             continue
         if graph.base is not None:
             clip = stand(clip, body, clips.stance[0], float(standing_height(body.model, clips.stance[:1])[0]))

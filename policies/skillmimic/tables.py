@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from drivers.sim.ball import MASS, RADIUS, RESTITUTION
-from policies.clips.library import robot_clips
 from policies.evaluate import Rate
 from policies.graph import one_hot
 from policies.skillmimic.env import Env
@@ -58,8 +57,8 @@ def sweep(graph: PolicyGraph, label: str, episodes: int, seconds: float, act: Ac
 def pairs(graph: PolicyGraph) -> list[tuple[str, str]]:
     """Every two skills of which the first ends, or begins again, with the ball in both hands, and the second begins so."""
     begins, ends = [], []
-    for label in graph.labels:
-        clips = [c for c in robot_clips(graph.config.robot, label) if c.name in graph.clips.names]
+    for k, label in enumerate(graph.labels):
+        clips = graph.clips.of(k)
         starts = all(c.contact[0, :2].all() for c in clips)
         begins += [label] * starts
         goes_on = label in (*graph.config.swing, *graph.config.loop)
@@ -75,17 +74,17 @@ def switched(graph: PolicyGraph, first: str, second: str, episodes: int, act: Ac
     ticks = np.array([ticks_of(graph, clip, SECOND) for clip in nexts])
     rest = np.where(clips.swing[env.clip] | clips.loop[env.clip], np.inf, clips.length[env.clip])  # rows
     waited = aiming(graph, int(env.clip[0]))
-    asked, began, ended = np.full((3, episodes), -1)
-    lost, up = np.zeros(episodes, bool), np.full(episodes, True)
+    began, ended = np.full((2, episodes), -1)
+    asked, lost, up = np.zeros(episodes, bool), np.zeros(episodes, bool), np.full(episodes, True)
     rows: list[Trace] = []
     with torch.no_grad():
         while not (lost | (ended >= 0)).all():
             late = len(rows) * config.period >= FIRST + waited
-            due = (asked < 0) & ~lost & (late | (env.since - rest >= REST / config.timestep))
+            due = ~asked & ~lost & (late | (env.since - rest >= REST / config.timestep))
             if due.any():
-                asked[due] = len(rows)
+                asked |= due
                 ask(env, np.flatnonzero(due), second)
-            now = (asked >= 0) & (began < 0) & ~lost & performs(env, second)
+            now = asked & (began < 0) & ~lost & performs(env, second)
             began[now] = len(rows)
             env.clip[now], env.row[now], env.since[now] = nexts[now], 0, 0
             _, _, dones, _ = env.step(act(env))
