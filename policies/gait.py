@@ -46,6 +46,10 @@ class Stride:
     idle: float = 0.05  # m/s (rad/s): a smaller command is none
 
 
+# Of a stride, that the clock is ahead when it starts: were its steps to meet exactly 0.5 on their way, that would be a rest,
+# and after it the same foot might step again.
+BEGUN = 1e-4
+
 # Which of a leg's joints do what, rad of each per rad of it.
 PARTS: dict[str, dict[str, float]] = {
     "line": {"hip_pitch": 1.0, "knee": 0.5},  # thigh and shin are equally long
@@ -149,8 +153,9 @@ class Gait(nn.Module):
         need = (command.abs().amax(-1, keepdim=True) > s.idle) | falling | (fast & ~resting)
         need = need & (bows < s.bow)
         unloaded = torch.where(lean.left_speed > 0, 0.5, 0.0)  # pushed to the left: the right foot is light
-        moved = torch.where(resting, unloaded, phase) + self.step
-        crossed = torch.floor(2 * moved) > torch.floor(2 * torch.where(resting, unloaded, phase) + 1e-6)
+        before = torch.where(resting, unloaded + BEGUN, phase)
+        moved = before + self.step
+        crossed = torch.floor(2 * moved) > torch.floor(2 * before + 1e-6)
         landed = torch.where(crossed & ~need, torch.floor(2 * moved) / 2, moved)
         following = landed - torch.floor(landed)
         return torch.where(resting & ~need, phase, following)

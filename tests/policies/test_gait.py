@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from policies.basics import Basics
-from policies.gait import Gait, Lean, Stride, single_loads
+from policies.gait import BEGUN, Gait, Lean, Stride, single_loads
 from policies.mirror import joint_mirror
 from sim2real.config import load_robot
 
@@ -50,9 +50,19 @@ def test_a_pose_with_flat_soles_pitches_the_base():
 
 def test_a_command_starts_the_clock_and_it_goes_round():
     phases = clock(0.0, 50, FORWARD)
-    assert phases[0] == pytest.approx(0.02 / STRIDE.period)
+    assert phases[0] == pytest.approx(0.02 / STRIDE.period + BEGUN)
     assert any(b < a for a, b in zip(phases, phases[1:], strict=False))
     assert all(0.0 <= p < 1.0 for p in phases)
+
+
+@pytest.mark.parametrize("aside", [-0.3, 0.0, 0.3])
+def test_feet_take_turns_and_neither_rests_while_they_walk(aside):
+    """At 0.5 exactly both rest, and after a rest whichever is light begins: a robot moved to the right stepped with the left."""
+    moving = STILL._replace(left_speed=torch.tensor([[aside]]))
+    phases = clock(0.0, 62, FORWARD, moving)
+    assert not {0.0, 0.5} & set(phases)
+    halves = [p >= 0.5 for p in phases]
+    assert sum(a != b for a, b in zip(halves, halves[1:], strict=False)) == 4  # of 0.3 s
 
 
 def test_a_step_once_begun_is_finished_and_then_the_feet_rest():
