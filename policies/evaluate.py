@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from policies.basics import Basics
 from policies.env import Env
@@ -61,7 +61,8 @@ class Episodes(NamedTuple):
 
 
 class FileActor:
-    """A policy file in every robot of an environment, fed what a robot would measure, each with a memory of its own.
+    """A policy file in every robot of an environment, fed what a robot would measure, each with a memory of its own. Where
+    there are more robots than files, the others have the same ``network`` on the environment's own observation.
 
     The environment turns actions into targets; Sim2realError if the file's own targets are others, because it was made
     with other settings than ``settings`` holds now.
@@ -69,8 +70,8 @@ class FileActor:
 
     settings = "policies/basics.py"
 
-    def __init__(self, path: Path, robots: int) -> None:
-        self.path = path
+    def __init__(self, path: Path, robots: int, network: nn.Module | None = None) -> None:
+        self.path, self.network = path, network
         first, data = load_policy(path, trial=0), path.read_bytes()  # proved once, run in every robot
         self.policies: list[Policy] = [first, *(Policy(data, first.contract, path) for _ in range(robots - 1))]
 
@@ -85,15 +86,19 @@ class FileActor:
     def __call__(self, env: Any) -> Tensor:
         signals = {name: signal.numpy() for name, signal in self.signals(env).items()}
         born = env.episode_length_buf.numpy() == 0
+        files = self.policies[: env.num_envs]
         actions = np.zeros((env.num_envs, env.num_actions), np.float32)
-        targets = np.zeros((env.num_envs, env.model.nu), np.float32)
-        for k, policy in enumerate(self.policies[: env.num_envs]):
+        if len(files) < env.num_envs and self.network is not None:
+            actions = env.graph.clip(self.network(env.observation)).numpy()
+        targets = np.zeros((len(files), env.model.nu), np.float32)
+        for k, policy in enumerate(files):
             if born[k]:
                 self.begin(env, k)
             outputs = policy.step({name: rows[k] for name, rows in signals.items()})
             actions[k], targets[k] = outputs["action"], outputs["joint_pos_target"]
         result = torch.from_numpy(actions)
-        error = float((env.graph.target(env.measured, result) - torch.from_numpy(targets)).abs().max())
+        theirs = env.graph.target(env.measured, result)[: len(files)]
+        error = float((theirs - torch.from_numpy(targets)).abs().max())
         if not error < 1e-3:
             raise Sim2realError(
                 f"{self.path}: its targets are up to {error:.2g} rad off those of {self.settings} for the same actions,"

@@ -50,6 +50,8 @@ class Stride:
 # and after it the same foot might step again.
 BEGUN = 1e-4
 
+EVEN = 0.3, 0.36  # of a step, from and to: what is let go there flies along with the base
+
 # Which of a leg's joints do what, rad of each per rad of it.
 PARTS: dict[str, dict[str, float]] = {
     "line": {"hip_pitch": 1.0, "knee": 0.5},  # thigh and shin are equally long
@@ -140,6 +142,12 @@ class Gait(nn.Module):
     def resting(phase: Tensor) -> Tensor:
         """Whether both feet are on the ground to stay (N, 1) bool."""
         return (phase == 0.0) | (phase == 0.5)
+
+    @staticmethod
+    def even(phase: Tensor) -> Tensor:
+        """Whether a walking base goes as fast as it does on average (N, 1) bool: the moment after a foot has left the ground."""
+        step = 2 * phase - torch.floor(2 * phase)
+        return (step > EVEN[0]) & (step < EVEN[1])
 
     def advance(self, phase: Tensor, command: Tensor, lean: Lean, steady: Tensor, bows: Tensor | float = 0.0) -> Tensor:
         """This tick's phase (N, 1) in [0, 1): the left foot is in the air before 0.5, the right one after it, and at

@@ -20,6 +20,7 @@ from bisect import insort
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from heapq import heapify, heappop, heappush
 from typing import Protocol
 
@@ -81,6 +82,7 @@ class Traffic:
     bus_off: int = 0  # how often the host's controller left the bus
 
 
+@lru_cache(4096)
 def priority(id: int) -> int:
     """Arbitration key of an identifier, the lowest wins: base identifier first, and a standard frame before an extended
     one with the same base (ISO 11898-1)."""
@@ -173,8 +175,8 @@ class SimCan:
     def take(self, ready: float, raw: bytes, ids: Iterable[int], bits: Iterable[int]) -> None:
         """Frames of the host, whose length on the wire is now known, enter its controller's queue."""
         size = self.frame.itemsize
-        for i, (id, n) in enumerate(zip(ids, bits, strict=True)):
-            self._queue.append((ready, priority(id), id, raw[size * i : size * i + size], n, 0))
+        raws = [raw[at : at + size] for at in range(0, len(raw), size)]
+        self._queue.extend([(ready, priority(id), id, r, n, 0) for id, r, n in zip(ids, raws, bits, strict=True)])
 
     def say(self, ready: float, answer: tuple[int, int, bytes, int]) -> None:
         """A motor wants to send a frame (row, key, raw frame, bits) from ``ready`` on, without having been asked."""

@@ -15,7 +15,7 @@ from policies.evaluate import FileActor, Rate
 from policies.skillmimic.curves import PAPER, Curve, learned, read, svg
 from policies.skillmimic.evaluate import BALL_NEAR, BODY_NEAR, Result, evaluate_skill, result, rule_of
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.release import graph_of
+from policies.skillmimic.release import graph_of, network_in
 from policies.skillmimic.tables import CELLS, FIRST, NOMINAL, REST, SECOND, pairs, sweep, switched
 from policies.skillmimic.through_bytes import BEFORE, graph_in, judged
 from policies.spread import spread
@@ -26,7 +26,8 @@ from sim2real.policy import load_policy
 
 SECONDS = 10.0  # of an episode; that of a skill that ends by itself ends with its clip
 TARGETS = {"hold": 0.95, "raise": 0.95, "carry": 0.95, "pass": 0.85, "shot": 0.85, "pickup": 0.70, "catch": 0.70,
-           "dribble_in_place": 0.60, "bounce": 0.60}  # fmt: skip
+           "dribble_in_place": 0.60, "bounce": 0.60, "bounce_walk": 0.60}  # fmt: skip
+FILES = 50  # robots of an environment that have a policy file each
 CELL = 25  # episodes of a cell of the tables, at most
 GAP = 0.05  # of success, the most that may be lost from training's world to the bytes with a camera
 WAYS = ("training", "truth", "camera")
@@ -63,9 +64,13 @@ class Evaluation(NamedTuple):
 
 
 class BallActor(FileActor):
-    """A policy file in every robot of this package's environment."""
+    """A policy file in robots of this package's environment, and its network in those beyond ``FILES``: a file takes a
+    thousand times as long."""
 
     settings = "policies/skillmimic/config.py"
+
+    def __init__(self, path: Path, robots: int) -> None:
+        super().__init__(path, min(robots, FILES), network_in(path) if robots > FILES else None)
 
     def signals(self, env: Any) -> dict[str, torch.Tensor]:
         return env.inputs

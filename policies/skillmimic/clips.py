@@ -56,7 +56,8 @@ class ReferenceClips:
         clips: list[Clip] = []
         labels: list[int] = []
         for k, skill in enumerate(config.skills):
-            found = [c for c in robot_clips(config.robot, skill) if not config.clips or c.name in config.clips]
+            label = config.borrows.get(skill, skill)
+            found = [c for c in robot_clips(config.robot, label) if not config.clips or c.name in config.clips]
             if not found:
                 raise ClipError(f"skill '{skill}': none of its clips is in {', '.join(config.clips)}, expected one")
             clips += found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 
@@ -17,7 +18,8 @@ class SkillMimic:
     skills: tuple[str, ...] = ("hold",)
     clips: tuple[str, ...] = ("hold_05",)  # only these of them, by name; none: all
     swing: tuple[str, ...] = ("hold", "carry")  # skills whose clips play to and fro; others end
-    loop: tuple[str, ...] = ("dribble_in_place", "bounce")  # skills whose clips begin again where they end
+    loop: tuple[str, ...] = ("dribble_in_place", "bounce", "bounce_walk")  # whose clips begin again where they end
+    borrows: dict[str, str] = field(default_factory=lambda: {"bounce_walk": "bounce"})  # clips of another label
     after: float = 1.0  # s that an episode goes on beyond the end of a clip, at its last frame
     practise: tuple[str, ...] = ()  # only these of the skills, for now; none: all
     anywhere: bool = True  # episodes start anywhere in a clip, not only at its beginning
@@ -28,10 +30,12 @@ class SkillMimic:
     base: str | None = None
     corrections: str | None = None  # of the plan of the arms (plan.py), a file; only with a base
     # skills in which the clip waits: for the ball, or for arms to be where it begins
-    timed: tuple[str, ...] = ("catch", "dribble_in_place", "bounce", "pickup")
-    walks: tuple[str, ...] = ()  # skills during which the base obeys velocity commands
+    timed: tuple[str, ...] = ("catch", "dribble_in_place", "bounce", "bounce_walk", "pickup")
+    # skills during which the base obeys velocity commands, and those it is trained on, from and to (forward m/s, left m/s,
+    # turn rad/s); None: its own
+    walks: dict[str, Sequence[Sequence[float]] | None] = field(default_factory=dict)
     bends: tuple[str, ...] = ("pickup",)  # skills in which the base bends legs and waist as the clip does
-    still: float = 0.3  # share of their episodes without any
+    still: float = 0.3  # share of their episodes without any, where none is one of those
     # the policy
     period: float = (
         0.02  # s: 50 Hz, against the paper's 60; retargeted clips are slower by the root of the length scale
@@ -90,9 +94,11 @@ BALL = {  # a clip each: the calmest, and those that come from and go to the fro
     "catch": "catch_06",
     "dribble_in_place": "dribble_in_place_01",
     "bounce": "bounce_01",
+    "bounce_walk": "bounce_01",
 }
+WALKS = {"carry": None, "bounce_walk": ((0.1, -0.1, -0.3), (0.3, 0.1, 0.3))}
 TASKS: dict[str, SkillMimic] = {
     "g1-ball": SkillMimic(base=BASE, corrections=PLAN, skills=tuple(BALL), clips=tuple(BALL.values()),
-                          walks=("carry",), frames=150),
+                          walks=WALKS, frames=150),
     "g1-pickup": SkillMimic(base=DOWN, corrections=PLAN, skills=("pickup",), clips=("pickup_09",), frames=400),
 }  # fmt: skip

@@ -366,11 +366,8 @@ class Env(VecEnv):
             self.carries["carry_base_posture"][ids] = torch.where(
                 self.graph.acts > 0, self.target[ids], _tensor(self.clips.stance[rows])
             )
-            low, high = self.graph.base.config.command_low, self.graph.base.config.command_high
-            some = rng.random((k, 1)) > self.config.still
-            self.command[ids] = _tensor(rng.uniform(low, high, (k, 3)) * some)
-            told = self.command[ids] * (self.skill[ids] @ self.graph.walks)
-            self.carries["carry_base_skill"][ids] = self.graph.gait(told)
+            self.command[ids] = _tensor(self.graph.draw(rng, self.clips.skill[self.clip[ids]]))
+            self.carries["carry_base_skill"][ids] = self.graph.gait(self.command[ids])
         self.sight.begin(ids, _ball_in_base(qpos, qvel))
         before = self.clips.rows(self.clip[ids], np.maximum(self.row[ids] - 1, 0))
         self._last_points[ids] = self.clips.motion(*before).points

@@ -109,6 +109,7 @@ RULES: dict[str, Callable[[Trace, float, int], float]] = {
     "dribble_in_place": _dribbled,
     "dribble_forward": _dribbled,
     "bounce": _bounced,
+    "bounce_walk": _bounced,
     "pickup": _picked,
 }
 """Success in [0, 1] of an episode of ``ticks``, had nothing failed, by skill; of every other skill: ``_kept``."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -40,7 +42,8 @@ class PolicyGraph(nn.Module):
     ankles: Tensor
     drive: Tensor
     acts: Tensor
-    walks: Tensor
+    slowest: Tensor
+    fastest: Tensor
     gaits: Tensor
     spread: Tensor
     lower: Tensor
@@ -80,10 +83,30 @@ class PolicyGraph(nn.Module):
             labels = list(self.base.labels)
             self.register_buffer("gaits", torch.eye(len(labels))[[labels.index("walk"), labels.index("stand")]])
             self.register_buffer("spread", _buffer(np.eye(len(acts))[self.acting]))  # arms to joints
-        self.register_buffer("walks", _buffer(np.array([[skill in config.walks] for skill in config.skills])))
+        self.paces = np.array([self._pace(skill) for skill in config.skills])  # (labels, 2, 3), from and to
+        self.register_buffer("slowest", _buffer(np.minimum(self.paces[:, 0], 0.0)))
+        self.register_buffer("fastest", _buffer(np.maximum(self.paces[:, 1], 0.0)))
         self.register_buffer("lower", _buffer(robot.position_min + config.position_margin))
         self.register_buffer("upper", _buffer(robot.position_max - config.position_margin))
         self.actor: nn.Module = nn.Identity()
+
+    def _pace(self, skill: str) -> tuple[Sequence[float], Sequence[float]]:
+        """Commands that ``skill`` is trained on, from and to, each (3,): forward m/s, left m/s, turn rad/s."""
+        if self.base is None or skill not in self.config.walks:
+            return (0.0,) * 3, (0.0,) * 3
+        low, high = self.config.walks[skill] or (self.base.config.command_low, self.base.config.command_high)
+        return low, high
+
+    def told(self, command: Tensor, skill: Tensor) -> Tensor:
+        """What of a ``command`` (N, 3) the base obeys during ``skill`` (N, labels)."""
+        return torch.minimum(torch.maximum(command, skill @ self.slowest), skill @ self.fastest)
+
+    def draw(self, rng: np.random.Generator, skill: np.ndarray) -> np.ndarray:
+        """(k, 3) commands for episodes of skills (k,), by index: none in a share ``config.still`` of them, of a skill that may
+        stand."""
+        low, high = self.paces[skill, 0], self.paces[skill, 1]
+        stands = ((low <= 0) & (high >= 0)).all(axis=1) & (rng.random(len(skill)) < self.config.still)
+        return rng.uniform(low, high) * ~stands[:, None]
 
     @property
     def history(self) -> int:
@@ -98,10 +121,15 @@ class PolicyGraph(nn.Module):
         target = signals.rest + action @ self.drive
         return torch.minimum(torch.maximum(target, self.lower), self.upper)
 
+    @staticmethod
+    def walking(command: Tensor) -> Tensor:
+        """Whether ``command`` (N, 3) says so (N, 1) bool."""
+        return command.abs().amax(dim=-1, keepdim=True) > WALKS
+
     def gait(self, command: Tensor) -> Tensor:
         """What the base does (N, its labels), one-hot: it walks where ``command`` (N, 3) says so, and else keeps its feet
         where they are; told to walk on the spot, it would drift towards a ball that it holds."""
-        moves = (command.abs().amax(dim=-1, keepdim=True) > WALKS).to(command.dtype)
+        moves = self.walking(command).to(command.dtype)
         return moves * self.gaits[0] + (1 - moves) * self.gaits[1]
 
     def remember(self, signals: Signals) -> Tensor:
@@ -170,14 +198,15 @@ class PolicyGraph(nn.Module):
             ankle = config.balance_gain * (gravity[:, 0:1] - skill @ self.lean) + config.balance_damping * gyro[:, 1:2]
             rest = posture + self.ankles * ankle
         else:
-            calm = Gait.resting(inputs["carry_base_gait"])
+            command = self.told(inputs["command_velocity"], skill)
+            steps = inputs["carry_base_gait"]
+            calm = Gait.resting(steps) | (Gait.even(steps) & self.walking(command))
             plan = self.plan(skill, last, inputs["carry_clock"], inputs["carry_arms"], ball, calm)
             planned = torch.cat([plan.ball_error, plan.clock / self.plan.longest], dim=-1)
             posture = plan.target @ self.spread
             # The base sees the arms on their way to where they were last sent.
             hands = self.acts * (posture - self.base.home + inputs["carry_action"] @ self.drive)
             pose = plan.pose * (1 - self.acts) + hands
-            command = inputs["command_velocity"] * (skill @ self.walks)
             given = {n.replace("carry_base", "carry"): v for n, v in inputs.items() if n.startswith("carry_base_")}
             seen = self.base.advance(*joints, orientation, gyro, command, self.gait(command), **given, pose=pose)
             action = self.base.clip(self.base.actor(observe_base(seen)))

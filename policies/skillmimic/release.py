@@ -7,7 +7,11 @@ import json
 from pathlib import Path
 
 import numpy as np
+import onnx
 import torch
+from onnx import numpy_helper
+from rsl_rl.modules import MLP
+from torch import nn
 
 from drivers.sim import ball
 from policies.evaluate import UNSEEN
@@ -23,11 +27,11 @@ from sim2real.contract import Contract
 from sim2real.policy import Policy
 from sim2real.types import Sim2realError
 
-SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "walks", "bends", "corrections", "timed", "period",
+SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "borrows", "walks", "bends", "corrections", "timed", "period",
             "timestep", "action_ratio", "action_max", "grip", "balance_gain", "balance_damping", "position_margin",
             "history", "frames", "throw", "placed", "terminations")  # fmt: skip
 ARMS_COME = 1.0  # s, at most, until arms are where a clip begins
-SHOWN, NONE = (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)  # m/s, m/s, rad/s: commands of a timeline that names none
+SHOWN, NONE = (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)  # m/s, m/s, rad/s: of a timeline that names none, at most
 GOLDEN_STEPS, GOLDEN = 40, 4  # ticks of each golden sequence, and how many
 
 
@@ -69,8 +73,8 @@ def export_graph(
             {
                 "label": label,
                 "description": f"{label}, {origin(graph, clip)}",
-                **({"dwell": dwell(graph, clip)} if label in config.bends else {}),
-                "velocity": SHOWN if label in config.walks else NONE,
+                **({} if label in (*config.swing, *config.loop) else {"dwell": dwell(graph, label, clip)}),
+                "velocity": np.clip(SHOWN, *graph.paces[graph.labels.index(label)]).tolist(),
                 "object": object_start(graph, clip),
             }
             for label, clip in zip(graph.labels, first_clips(graph), strict=True)
@@ -98,10 +102,11 @@ def export_graph(
     return export(graph, path, fields=fields, sequences=sequences)
 
 
-def dwell(graph: PolicyGraph, clip: int) -> float:
-    """s that clip number ``clip`` takes, with what comes before: who is down goes through with it, for no other skill begins
-    from there."""
-    return graph.clips.seconds(clip) + SETTLE * graph.config.period + ARMS_COME
+def dwell(graph: PolicyGraph, label: str, clip: int) -> float:
+    """s that a skill with clip number ``clip`` takes, with what comes before where the base bends: who throws or is down goes
+    through with it, for no other skill begins from there."""
+    before = SETTLE * graph.config.period + ARMS_COME if label in graph.config.bends else 0.0
+    return graph.clips.seconds(clip) + before
 
 
 def origin(graph: PolicyGraph, clip: int) -> str:
@@ -122,6 +127,19 @@ def graph_of(contract: Contract) -> PolicyGraph:
         raise Sim2realError(f"{contract.name}: its provenance has no 'settings': export it again (sim2real export)")
     fields = {name: tuple(v) if isinstance(v, list) else v for name, v in json.loads(text).items()}
     return PolicyGraph(SkillMimic(**fields))
+
+
+def network_in(path: Path) -> nn.Module:
+    """The actor in the policy file ``path``."""
+    weights = {
+        t.name: torch.tensor(numpy_helper.to_array(t))
+        for t in onnx.load_from_string(path.read_bytes()).graph.initializer
+    }
+    own = {name.removeprefix("actor."): w for name, w in weights.items() if name.startswith("actor.")}
+    *hidden, last = [w for name, w in own.items() if name.endswith("weight")]
+    network = MLP(hidden[0].shape[1], len(last), [len(w) for w in hidden], "elu")
+    network.load_state_dict(own)
+    return network
 
 
 def record(graph: PolicyGraph) -> tuple[list[dict[str, np.ndarray]], list[dict[str, np.ndarray]]]:

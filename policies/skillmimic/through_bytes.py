@@ -255,10 +255,8 @@ def graph_in(path: Path) -> PolicyGraph:
 
 def command(graph: PolicyGraph, label: str, rng: np.random.Generator) -> tuple[float, float, float]:
     """A velocity command (m/s, m/s, rad/s) for an episode of a skill, drawn as training draws them."""
-    if graph.base is None or label not in graph.config.walks or rng.random() < graph.config.still:
-        return NONE
-    forward, left, turn = rng.uniform(graph.base.config.command_low, graph.base.config.command_high)
-    return float(forward), float(left), float(turn)
+    forward, left, turn = graph.draw(rng, np.array([graph.labels.index(label)]))[0].tolist()
+    return forward, left, turn
 
 
 def random_ball(rng: np.random.Generator) -> dict[str, float]:

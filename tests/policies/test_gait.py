@@ -65,6 +65,13 @@ def test_feet_take_turns_and_neither_rests_while_they_walk(aside):
     assert sum(a != b for a, b in zip(halves, halves[1:], strict=False)) == 4  # of 0.3 s
 
 
+def test_a_walk_is_even_soon_after_either_foot_has_left_the_ground():
+    phases = torch.linspace(0.005, 0.995, 100)[:, None]
+    even = GAIT.even(phases)[:, 0]
+    assert even.sum() == 6 and torch.equal(even[:50], even[50:])
+    assert not GAIT.even(torch.tensor([[0.0], [0.5]])).any()  # at rest
+
+
 def test_a_step_once_begun_is_finished_and_then_the_feet_rest():
     phases = clock(0.2, 40)
     assert phases[0] > 0.2 and phases[-1] == 0.5 and phases == sorted(phases)

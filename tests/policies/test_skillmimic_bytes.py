@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from rsl_rl.modules import MLP
 
 from drivers.bus import BusError
 from policies.clips.kinematics import multiply, rotate
+from policies.skillmimic import card
 from policies.skillmimic.card import BallActor
 from policies.skillmimic.config import TASKS
 from policies.skillmimic.evaluate import evaluate_skill, ticks_of
@@ -34,9 +36,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def graph():
     """It has learned nothing: arms rest in their posture."""
     graph = PolicyGraph(CONFIG)
-    graph.actor = torch.nn.Linear(graph.outputs()["observation"][0], len(graph.acting))
-    torch.nn.init.zeros_(graph.actor.weight)
-    torch.nn.init.zeros_(graph.actor.bias)
+    graph.actor = MLP(graph.outputs()["observation"][0], len(graph.acting), [2], "elu")
+    for weights in graph.actor.parameters():
+        torch.nn.init.zeros_(weights)
     return graph.eval()
 
 
@@ -54,9 +56,13 @@ def test_the_contract_has_the_legs_of_the_stance_and_the_commands_of_the_base(gr
 
 
 @pytest.mark.slow
-def test_the_file_does_in_training_what_the_graph_does(graph, file):
-    """Starts anywhere in a clip included: the file's memory begins as the environment's."""
-    of_file = evaluate_skill(graph, "hold", 4, 0.4, act=BallActor(file, 4))
+@pytest.mark.parametrize("files", [4, 1])
+def test_the_file_does_in_training_what_the_graph_does(graph, file, files, monkeypatch):
+    """Starts anywhere in a clip included: the file's memory begins as the environment's. And so does its network alone."""
+    monkeypatch.setattr(card, "FILES", files)
+    actor = BallActor(file, 4)
+    assert len(actor.policies) == files
+    of_file = evaluate_skill(graph, "hold", 4, 0.4, act=actor)
     of_graph = evaluate_skill(graph, "hold", 4, 0.4)
     assert of_file.success == of_graph.success and of_file.ball_error == pytest.approx(of_graph.ball_error, abs=1e-4)
 

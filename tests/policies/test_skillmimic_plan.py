@@ -12,6 +12,7 @@ import yaml
 
 from drivers.sim.ball import MASS
 from policies.clips.library import robot_clips
+from policies.gait import EVEN
 from policies.skillmimic.clips import grip
 from policies.skillmimic.config import TASKS
 from policies.skillmimic.env import Env
@@ -168,9 +169,11 @@ def test_at_the_first_tick_there_is_nothing_to_finish():
 def test_no_ball_is_let_go_while_the_feet_step():
     plan = Plan([rows(loop=True, away=4)], [correction()])
     clocks = {
-        calm: [float(at(plan, c, where(c + 1), calm=calm).clock) for c in (2.0, 3.0, 5.0)] for calm in (True, False)
+        calm: [float(at(plan, c, where(c + 1), calm=calm).clock) for c in (1.5, 2.0, 2.5, 3.0, 5.0)]
+        for calm in (True, False)
     }
-    assert clocks == {True: [3.0, 4.0, 6.0], False: [2.0, 3.0, 6.0]}
+    assert clocks[True] == [2.5, 3.0, 3.5, 4.0, 6.0]
+    assert clocks[False] == [2.5, 2.0, 2.5, 4.0, 6.0]  # from 3.0 on hands open: they do not stop half-way
 
 
 def test_legs_bend_when_the_feet_have_rested_for_a_while():
@@ -212,6 +215,41 @@ def test_what_was_found_is_read_back(tmp_path):
 def graph():
     config = dataclasses.replace(TASKS["g1-ball"], envs=8, threads=1, anywhere=False, push_chance=0.0)
     return PolicyGraph(config)
+
+
+def test_a_base_walks_no_faster_than_its_skill_is_trained_for(graph):
+    skill = torch.eye(len(graph.labels))
+    fast, back = (
+        dict(zip(graph.labels, graph.told(x * torch.ones(1, 3), skill).tolist(), strict=True)) for x in (2.0, -2.0)
+    )
+    assert fast["hold"] == [0.0] * 3 and fast["bounce_walk"] == pytest.approx([0.3, 0.1, 0.3])
+    assert back["bounce_walk"] == pytest.approx([0.0, -0.1, -0.3])  # it may stand, and goes not backwards
+    assert fast["carry"] == pytest.approx(graph.base.config.command_high)
+
+
+def test_a_skill_that_may_stand_does_so_in_some_episodes(graph):
+    commands = {label: graph.draw(np.random.default_rng(0), np.full(200, k)) for k, label in enumerate(graph.labels)}
+    stands = {label: float((x == 0).all(axis=1).mean()) for label, x in commands.items()}
+    assert stands["hold"] == 1 and stands["bounce_walk"] == 0 and 0.2 < stands["carry"] < 0.4
+    forward = commands["bounce_walk"][:, 0]
+    assert 0.1 <= forward.min() and forward.max() <= 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("skill", "phases"), [("bounce", ()), ("bounce_walk", EVEN)])
+def test_a_ball_is_let_go_by_feet_that_rest_or_in_the_even_part_of_a_step(graph, skill, phases):
+    env = Env(graph.config, 5, graph, skill)
+    k, let_go = graph.labels.index(skill), []
+    now = lambda: (graph.plan.first[k] + env.carries["carry_clock"].clamp(min=0).floor())[:, 0].long()  # noqa: E731
+    away = lambda: graph.plan.away[graph.plan.following[now()]][:, 0]  # noqa: E731
+    with torch.no_grad():
+        for _ in range(100):
+            before, gait = away(), env.carries["carry_base_gait"][:, 0].clone()
+            env.step(torch.zeros(env.num_envs, env.num_actions))
+            going = (before == 0) & (away() > 0) & (env.episode_length_buf > 1)
+            let_go += gait[going].tolist()
+    steps = [2 * p % 1 for p in let_go]
+    assert len(let_go) > 4 and all(s == 0 or (phases and phases[0] < s < phases[1]) for s in steps)
 
 
 def test_both_arms_are_corrected_alike_but_for_a_dribble(graph):
