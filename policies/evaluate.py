@@ -88,17 +88,17 @@ class FileActor:
         born = env.episode_length_buf.numpy() == 0
         files = self.policies[: env.num_envs]
         actions = np.zeros((env.num_envs, env.num_actions), np.float32)
-        if len(files) < env.num_envs and self.network is not None:
-            actions = env.graph.clip(self.network(env.observation)).numpy()
-        targets = np.zeros((len(files), env.model.nu), np.float32)
+        told = env.num_envs
+        if self.network is not None:
+            actions, told = env.graph.clip(self.network(env.observation)).numpy(), len(files)
+        targets = np.zeros((told, env.model.nu), np.float32)
         for k, policy in enumerate(files):
             if born[k]:
                 self.begin(env, k)
             outputs = policy.step({name: rows[k] for name, rows in signals.items()})
             actions[k], targets[k] = outputs["action"], outputs["joint_pos_target"]
         result = torch.from_numpy(actions)
-        theirs = env.graph.target(env.measured, result)[: len(files)]
-        error = float((theirs - torch.from_numpy(targets)).abs().max())
+        error = float((env.graph.target(env.measured, result)[:told] - torch.from_numpy(targets)).abs().max())
         if not error < 1e-3:
             raise Sim2realError(
                 f"{self.path}: its targets are up to {error:.2g} rad off those of {self.settings} for the same actions,"

@@ -64,8 +64,8 @@ class Evaluation(NamedTuple):
 
 
 class BallActor(FileActor):
-    """A policy file in robots of this package's environment, and its network in those beyond ``FILES``: a file takes a
-    thousand times as long."""
+    """A policy file in ``FILES`` robots of this package's environment, and the file's network alone in those beyond: that is
+    one product for all of them."""
 
     settings = "policies/skillmimic/config.py"
 
@@ -177,7 +177,8 @@ each skill's own rule, which for all of them includes: no termination of the tra
 through the bytes no fault of the safety gate. Acc., E_b, E_o (m) and E_cg as in the paper (section 6.2), a right frame
 being one with the ball within {BALL_NEAR:g} m, the body within {BODY_NEAR:g} m and every contact right: the paper's thresholds
 times the robot's length scale. Robots, balls and trackers are drawn from randomisation that training never saw; through
-the bytes, bodies and balls. A ball that is thrown flies up to {throw:g} m/s otherwise than in its clip, along each axis.
+the bytes, bodies and balls. In training's environment {FILES} robots of each skill have the file itself, and the others its
+network over the same formulas. A ball that is thrown flies up to {throw:g} m/s otherwise than in its clip, along each axis.
 
 | skill | where | success | Acc. | E_b | E_o | E_cg |
 |---|---|---|---|---|---|---|

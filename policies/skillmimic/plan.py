@@ -195,11 +195,9 @@ class Plan(nn.Module):
         bounce = skill @ self.bounce
         ahead = torch.where(loop > 0, fallen - bounce * torch.round(fallen / bounce), along)  # s
         rate = torch.clamp(same + planned[:, 6:] * ahead, 0.0, 2.0)
-        after, soon = (
-            row + 1,
-            self._row(skill, clock + rate) + 1,
-        )  # towards which targets are on their way, now and then
-        after, soon = (rows.clamp(max=len(self.away) - 1) for rows in (after, soon))
+        # Rows that targets are on their way to, now and then: hands that have begun to open do not stop half-way.
+        most = len(self.away) - 1
+        after, soon = (row + 1).clamp(max=most), (self._row(skill, clock + rate) + 1).clamp(max=most)
         lets_go = (self.away[after] == 0) & (self.away[soon] > 0)
         settles = (clock < 0) & (skill @ self.settle > 0)
         rate = torch.where((lets_go | settles) & ~calm, 0.0, rate)
