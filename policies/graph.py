@@ -95,7 +95,7 @@ class PolicyGraph(nn.Module):
         phase, posture = self.references.advance(skill, carry_skill, carry_phase, carry_posture, pose)
         command = self.gait.ramp(carry_command, command_velocity * (skill @ self.walks))
         # A pose may pitch the base; what matters is how it is turned from there.
-        pitch, last = self.gait.pitch(posture - self.home), self.gait.pitch(carry_posture - self.home)
+        pitch, last = self.pitch(posture), self.pitch(carry_posture)
         gravity = pitched(gravity_in_base(orientation_base_in_world), pitch)
         gyro = angular_velocity_base_in_base - nn.functional.pad((pitch - last) / self.config.period, (1, 1))
         lean = self.gait.lean(carry_gait, gravity, angular_velocity_base_in_base, joint_pos - posture, joint_vel)
@@ -104,6 +104,11 @@ class PolicyGraph(nn.Module):
         reference = posture + self.gait.offsets(gait, command, lean)
         return Signals(joint_pos, joint_vel, gravity, gyro, skill, self.home, phase, posture, command, gait, capture,
                        reference, carry_action)  # fmt: skip
+
+    def pitch(self, posture: Tensor) -> Tensor:
+        """How far a posture (N, n) rad pitches the base (N, 1) rad. Nothing but going down to the floor is meant to: whoever
+        was not trained for that is level, and a posture on its way up from a squat is no bow."""
+        return self.gait.pitch(posture - self.home) if self.config.down else torch.zeros_like(posture[:, :1])
 
     def target(self, signals: Signals, action: Tensor) -> Tensor:
         """Joint targets (N, n) rad for a clipped ``action`` (N, driven)."""
@@ -120,7 +125,7 @@ class PolicyGraph(nn.Module):
             torch.ones_like(gyro[:, :1]),
         )
         lean = config.balance_offset + config.balance_gain * pitch + config.balance_damping * gyro[:, 1:2]
-        bow = torch.clamp(self.gait.pitch(signals.posture - self.home) / BOWED, 0.0, 1.0)
+        bow = torch.clamp(self.pitch(signals.posture) / BOWED, 0.0, 1.0)
         return lean * self.ankles + bow * (torch.cat([roll, gyro[:, 0:1], pitch, one], dim=-1) @ self.bowing)
 
     def clip(self, action: Tensor) -> Tensor:
