@@ -107,7 +107,7 @@ class PolicyGraph(nn.Module):
 
     def pitch(self, posture: Tensor) -> Tensor:
         """How far a posture (N, n) rad pitches the base (N, 1) rad. Nothing but going down to the floor is meant to: whoever
-        was not trained for that is level, and a posture on its way up from a squat is no bow."""
+        was not trained for that is level, and a posture on its way into a squat or out of it is no bow."""
         return self.gait.pitch(posture - self.home) if self.config.down else torch.zeros_like(posture[:, :1])
 
     def target(self, signals: Signals, action: Tensor) -> Tensor:

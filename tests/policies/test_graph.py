@@ -44,6 +44,18 @@ def test_a_pitch_that_the_pose_asks_for_is_none_to_balance_against():
     np.testing.assert_allclose(pitched(gravity_in_base(turned), torch.tensor([[pitch]])), [[0.0, 0.0, -1.0]], atol=1e-6)
 
 
+def test_only_who_goes_down_to_the_floor_bows():
+    """Joints that go into a squat or rise from it at one rate each pass no level pose on the way, and that is meant as none."""
+    goes_down = PolicyGraph(Basics(down=0.5))
+    squat = GRAPH.references.goal(standing(label="squat").skill, torch.tensor([[0.5]]))
+    sinking, rising = (a + torch.clamp(b - a, -0.6, 0.6) for a, b in ((GRAPH.home, squat), (squat, GRAPH.home)))
+    assert goes_down.pitch(sinking) > 0.3 > -0.3 > goes_down.pitch(rising)
+    assert GRAPH.pitch(sinking) == GRAPH.pitch(rising) == 0
+    at_rest = standing()._replace(posture=sinking)
+    torch.testing.assert_close(GRAPH.balance(at_rest), GRAPH.balance(standing()))
+    assert (goes_down.balance(at_rest) - GRAPH.balance(at_rest)).abs().max() > 0.01
+
+
 def test_ankles_push_against_pitch_and_pitch_rate():
     assert reflex("left_ankle_pitch_joint", pitch=0.05) > reflex("left_ankle_pitch_joint") + 0.1
     assert reflex("left_ankle_pitch_joint", pitch=-0.05) < reflex("left_ankle_pitch_joint") - 0.1
