@@ -88,11 +88,10 @@ EXPANDED = ("geom_friction", "body_mass", "body_inertia", "body_ipos", "actuator
 
 
 class Randomisation:
-    """Draws the table for the simulations of a batch. ``drawn[name]``: (sims, size). ``table`` may be changed between draws,
-    and ``fixed[name]`` (sims,) is what a term is instead, where it is not NaN."""
+    """Draws the table for the simulations of a batch. ``drawn[name]``: (sims, size); ``fixed[name]`` (sims,), which may
+    be changed between draws, is what a term is instead, where it is not NaN."""
 
     def __init__(self, batch: Batch, model: mujoco.MjModel) -> None:
-        self.table = TABLE
         self.fixed: dict[str, np.ndarray] = {}
         self._batch, self._model = batch, model
         self._fields = {field: batch.expand(field) for field in EXPANDED}
@@ -102,7 +101,7 @@ class Randomisation:
 
     def draw(self, ids: np.ndarray, rng: np.random.Generator) -> None:
         """New robots, balls and trackers in the simulations ``ids`` (k,)."""
-        for name, term in self.table.items():
+        for name, term in TABLE.items():
             x = rng.uniform(term.low, term.high, (len(ids), self._sizes[name]))
             if name in self.fixed:
                 given = self.fixed[name][ids, None]
