@@ -186,6 +186,10 @@ def eased(u: np.ndarray) -> np.ndarray:
     return u**3 * (10 - 15 * u + 6 * u**2)
 
 
+# While walking. Nearer, a thigh that swings meets the ball on its way up.
+WALKING = Drop(ahead=0.25)
+
+
 def dribble(body: RobotBody, name: str, side: str, stroke: Stroke = Stroke()) -> Clip:
     """One stroke of ``side``'s hand, from peak to peak, its palm looking down."""
     ahead, aside = stroke.place

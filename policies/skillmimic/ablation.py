@@ -24,6 +24,7 @@ from policies.skillmimic.rewards import SENSITIVITIES, VARIANTS
 from policies.skillmimic.train import SkillTraining, load_graph
 
 FOLDER = Path("runs/ablation")
+LARGE = {"frames": 150, "push_chance": 0.01, "learning_rate": 5e-4, "std": 0.15}
 HEAD = "What the contact graph and the product of rewards are worth"
 NOTE = """Written by `python -m policies.skillmimic.ablation`; do not edit. The paper's Table 1: one skill, one reward each
 (equations of its appendix B.1), the same samples, networks and settings. The plan under the policy is the bare clip: no
@@ -33,10 +34,10 @@ variants by. Acc., E_o and E_cg as in the paper's section 6.2."""
 
 
 def bare(task: str, seed: int, samples: float) -> SkillMimic:
-    """The task's settings with a plan that is the bare clip. Nothing is selected: the last checkpoint counts."""
-    return dataclasses.replace(
-        TASKS[task], corrections=None, grip=0.0, seed=seed, samples=samples, evaluate_every=10**9
-    )
+    """The task's settings with a plan that is the bare clip, and so with larger steps. Nothing is selected: the last
+    checkpoint counts."""
+    config = dataclasses.replace(TASKS[task], corrections=None, grip=0.0, seed=seed, samples=samples)
+    return dataclasses.replace(config, evaluate_every=10**9, **LARGE)
 
 
 def config_of(task: str, skill: str, variant: str, seed: int, samples: float) -> SkillMimic:

@@ -56,8 +56,7 @@ class ReferenceClips:
         clips: list[Clip] = []
         labels: list[int] = []
         for k, skill in enumerate(config.skills):
-            label = config.borrows.get(skill, skill)
-            found = [c for c in robot_clips(config.robot, label) if not config.clips or c.name in config.clips]
+            found = [c for c in robot_clips(config.robot, skill) if not config.clips or c.name in config.clips]
             if not found:
                 raise ClipError(f"skill '{skill}': none of its clips is in {', '.join(config.clips)}, expected one")
             clips += found

@@ -16,7 +16,7 @@ from policies.observations import observe as observe_base
 from policies.skillmimic.clips import ReferenceClips
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.observations import Signals, observe, present
-from policies.skillmimic.plan import ROOT, Plan
+from policies.skillmimic.plan import RESTED, ROOT, Plan
 from policies.skillmimic.plan import read as corrections
 from policies.skillmimic.world import training_world
 from policies.train import graph_of
@@ -165,7 +165,12 @@ class PolicyGraph(nn.Module):
             **(
                 {}
                 if self.base is None
-                else {"carry_skill": [len(self.labels)], "carry_clock": [1], "carry_arms": [len(self.acting)]}
+                else {
+                    "carry_skill": [len(self.labels)],
+                    "carry_clock": [1],
+                    "carry_arms": [len(self.acting)],
+                    "carry_rested": [1],
+                }
             ),
             **{_of_base(name): shape for name, shape in base.items() if name.startswith("carry_")},
         }
@@ -200,7 +205,8 @@ class PolicyGraph(nn.Module):
         else:
             command = self.told(inputs["command_velocity"], skill)
             steps = inputs["carry_base_gait"]
-            calm = Gait.resting(steps) | (Gait.even(steps) & self.walking(command))
+            rested = (inputs["carry_rested"] + 1) * Gait.resting(steps)
+            calm = (rested >= RESTED) | (Gait.even(steps) & self.walking(command))
             plan = self.plan(skill, last, inputs["carry_clock"], inputs["carry_arms"], ball, calm)
             planned = torch.cat([plan.ball_error, plan.clock / self.plan.longest], dim=-1)
             posture = plan.target @ self.spread
@@ -211,7 +217,8 @@ class PolicyGraph(nn.Module):
             seen = self.base.advance(*joints, orientation, gyro, command, self.gait(command), **given, pose=pose)
             action = self.base.clip(self.base.actor(observe_base(seen)))
             rest = torch.where(self.acts > 0, posture, self.base.target(seen, action))
-            carried = {"carry_skill": skill + 0.0, "carry_clock": plan.clock, "carry_arms": plan.target}
+            carried = {"carry_skill": skill + 0.0, "carry_clock": plan.clock, "carry_arms": plan.target,
+                       "carry_rested": rested}  # fmt: skip
             carried |= {_of_base(name): value for name, value in self.base.carries(seen, action).items()}
         return Signals(*joints, gravity, gyro, skill, inputs["object_position_in_base"],
                        inputs["object_velocity_in_base"], rest, planned, inputs["carry_action"],

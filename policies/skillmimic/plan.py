@@ -26,7 +26,10 @@ KNOTS = 8  # of a skill that moves
 # The furthest that palms follow the ball: m forwards, left, up; rad tipped forwards, left.
 REACH = np.array([0.15, 0.15, 0.25, 0.5, 0.5])
 TIPS = slice(3, 5)  # of these
-SETTLE = 25.0  # rows for which the feet rest before legs bend
+RESTED = (
+    8.0  # ticks that feet rest until it counts: who has just made a step still sways, and a ball flies off with that
+)
+SETTLE = 17.0  # rows for which they go on resting before legs bend
 LOST = 0.4  # m from its plan: a ball farther away does not come back
 SLOW = 0.5  # m/s: a ball slower than this says little about the time
 # rad a tick: how fast targets go to where a skill begins. Arms that are thrown there throw the robot off its feet.
@@ -148,8 +151,8 @@ class Plan(nn.Module):
         calm: Tensor,
     ) -> Planned:
         """``skill`` (N, labels) one-hot, and that of the tick before with its clock (N, 1) and targets (N, arms); ``ball``
-        (N, 6) m and m/s in the base; ``calm`` (N, 1) bool: the feet rest, without which no ball is let go that is to come
-        back, and no leg bent."""
+        (N, 6) m and m/s in the base; ``calm`` (N, 1) bool: the feet have rested (or are at the right place of a stride), without
+        which no ball is let go that is to come back, and no leg bent."""
         same = (skill * last_skill).sum(dim=-1, keepdim=True)
         last, loop, ready = skill @ self.last, skill @ self.loop, skill @ self.ready
         clock, rate = self._step(skill, same * last_clock, same, last, loop, ball, calm)

@@ -19,7 +19,7 @@ from policies.export import envelope, export
 from policies.skillmimic.config import SkillMimic
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.plan import SETTLE, samples
+from policies.skillmimic.plan import RESTED, SETTLE, samples
 from policies.skillmimic.starts import approach, first_clips, object_start, start_posture
 from policies.skillmimic.train import load_graph
 from policies.training import git_revision
@@ -27,7 +27,7 @@ from sim2real.contract import Contract
 from sim2real.policy import Policy
 from sim2real.types import Sim2realError
 
-SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "borrows", "walks", "bends", "corrections", "timed", "period",
+SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "walks", "bends", "corrections", "timed", "period",
             "timestep", "action_ratio", "action_max", "grip", "balance_gain", "balance_damping", "position_margin",
             "history", "frames", "throw", "placed", "terminations")  # fmt: skip
 ARMS_COME = 1.0  # s, at most, until arms are where a clip begins
@@ -105,7 +105,7 @@ def export_graph(
 def dwell(graph: PolicyGraph, label: str, clip: int) -> float:
     """s that a skill with clip number ``clip`` takes, with what comes before where the base bends: who throws or is down goes
     through with it, for no other skill begins from there."""
-    before = SETTLE * graph.config.period + ARMS_COME if label in graph.config.bends else 0.0
+    before = (RESTED + SETTLE) * graph.config.period + ARMS_COME if label in graph.config.bends else 0.0
     return graph.clips.seconds(clip) + before
 
 

@@ -103,8 +103,10 @@ def switched(graph: PolicyGraph, first: str, second: str, episodes: int, act: Ac
 
 
 def ask(env: Env, ids: np.ndarray, label: str) -> None:
-    """The robots ``ids`` (k,) are told to do ``label`` now; nothing else about them changes."""
-    env.skill[ids] = one_hot([env.graph.labels.index(label)], len(env.graph.labels))
+    """The robots ``ids`` (k,) are told to do ``label`` now, as fast as training tells them to."""
+    graph, skill = env.graph, env.graph.labels.index(label)
+    env.skill[ids] = one_hot([skill], len(graph.labels))
+    env.command[ids] = torch.from_numpy(graph.draw(env.rng, np.full(len(ids), skill)).astype(np.float32))
     env._observe()
 
 

@@ -12,13 +12,13 @@ import yaml
 
 from drivers.sim.ball import MASS
 from policies.clips.library import robot_clips
-from policies.gait import EVEN
+from policies.gait import EVEN, Gait
 from policies.skillmimic.clips import grip
 from policies.skillmimic.config import TASKS
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PULL, PolicyGraph
 from policies.skillmimic.optimise import Search, optimise, score, write
-from policies.skillmimic.plan import APPROACH, KNOTS, REACH, SETTLE, TIPS, Correction, Plan, Rows, read, samples
+from policies.skillmimic.plan import APPROACH, KNOTS, REACH, RESTED, SETTLE, TIPS, Correction, Plan, Rows, read, samples
 from sim2real.types import Sim2realError
 
 ARMS, T = 2, 8
@@ -227,6 +227,14 @@ def test_a_base_walks_no_faster_than_its_skill_is_trained_for(graph):
     assert fast["carry"] == pytest.approx(graph.base.config.command_high)
 
 
+def test_feet_have_rested_only_when_they_have_done_so_for_a_while(graph):
+    env = Env(graph.config, 3, graph, "hold")
+    steps = torch.tensor([0.0, 0.5, 0.4, 0.0])
+    env.carries["carry_base_gait"][:4, 0], env.carries["carry_rested"][:4, 0] = steps, torch.tensor([0.0, 6, 9, 20])
+    env._observe()
+    assert env.measured.carried["carry_rested"][:4, 0].tolist() == [1, 7, 0, 21]
+
+
 def test_a_skill_that_may_stand_does_so_in_some_episodes(graph):
     commands = {label: graph.draw(np.random.default_rng(0), np.full(200, k)) for k, label in enumerate(graph.labels)}
     stands = {label: float((x == 0).all(axis=1).mean()) for label, x in commands.items()}
@@ -245,9 +253,11 @@ def test_a_ball_is_let_go_by_feet_that_rest_or_in_the_even_part_of_a_step(graph,
     with torch.no_grad():
         for _ in range(100):
             before, gait = away(), env.carries["carry_base_gait"][:, 0].clone()
+            rested = env.carries["carry_rested"][:, 0] + 1
             env.step(torch.zeros(env.num_envs, env.num_actions))
             going = (before == 0) & (away() > 0) & (env.episode_length_buf > 1)
             let_go += gait[going].tolist()
+            assert (rested[going & Gait.resting(gait)] >= RESTED).all()
     steps = [2 * p % 1 for p in let_go]
     assert len(let_go) > 4 and all(s == 0 or (phases and phases[0] < s < phases[1]) for s in steps)
 

@@ -100,12 +100,15 @@ def test_a_switch_is_told_once_and_judged_by_the_second_skill(graph, monkeypatch
     told = []
 
     def look(env):
-        told.append((env.inputs["skill"].argmax(dim=1).tolist(), env.row.tolist()))
+        walks = graph.walking(env.inputs["command_velocity"])[:, 0].tolist()
+        told.append((env.inputs["skill"].argmax(dim=1).tolist(), env.row.tolist(), walks))
         return still(env)
 
     shares = switched(graph, "hold", "carry", 4, look)
-    assert [skills for skills, _ in told] == [[0] * 4] * 5 + [[1] * 4] * 15
+    assert [skills for skills, _, _ in told] == [[0] * 4] * 5 + [[1] * 4] * 15
     assert told[5][1] == [0] * 4 and told[6][1] == [4] * 4
+    assert not any(told[4][2]) and any(told[5][2]), "who is to carry is told where to"
+    assert told[5][2] == told[-1][2]
     assert len(shares) == 4 and set(shares) <= {0.0, 1.0} and shares.mean() >= 0.5
 
 
