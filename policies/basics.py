@@ -82,6 +82,7 @@ class Basics:
     seed: int = 1
     envs: int = 512
     threads: int = 2  # of the physics; the networks have one more
+    device: str = "cpu"  # of the learner; "cuda": a GPU
     # the policy
     period: float = 0.02  # s
     hidden: tuple[int, ...] = (256, 128)

@@ -31,7 +31,7 @@ class Training(training.Training):
 
     def graph(self) -> PolicyGraph:
         graph = PolicyGraph(self.config)
-        graph.actor, graph.critic = networks(self.ppo)
+        graph.actor, graph.critic = (self.beside_physics(network) for network in networks(self.ppo))
         return graph.eval()
 
     def evaluate(self) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import io
 import json
@@ -29,12 +30,14 @@ class Training:
 
     A kind of task says how its environment and networks are made (``make``), what its policy graph is (``graph``) and how
     good that is (``evaluate``). Under torchrun every process simulates ``config.envs`` robots of its own and the
-    gradients are averaged (gloo).
+    gradients are averaged (gloo). The physics are the CPU's, the learner is where ``config.device`` says. Raises Sim2realError
+    where there is none.
     """
 
     def __init__(self, config: Any, folder: Path) -> None:
         self.config, self.folder = config, folder
         self.rank, self.world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+        self.device = learner_device(config.device)
         torch.set_num_threads(1)
         torch.manual_seed(config.seed + self.rank)
         if self.world > 1:
@@ -55,6 +58,10 @@ class Training:
     def evaluate(self) -> dict[str, float]:
         """What training selects by, as ``score``, and whatever else belongs into the curve."""
         raise NotImplementedError
+
+    def beside_physics(self, network: nn.Module) -> nn.Module:
+        """``network`` itself, or its copy where the learner is elsewhere."""
+        return network if self.device.type == "cpu" else copy.deepcopy(network).cpu()
 
     def run(self, report: Report = lambda row: None) -> None:
         """Until ``config.samples`` have been seen. ``report(row)`` after each iteration."""
@@ -82,15 +89,17 @@ class Training:
 
     def step(self) -> dict[str, float]:
         """One iteration: collect ``horizon`` ticks, update. Returns a row of the curve."""
-        config, ppo, env = self.config, self.ppo, self.env
+        config, ppo, env, device = self.config, self.ppo, self.env, self.device
         ppo.train_mode()
         total, survived, fell = 0.0, 0, 0
         with torch.no_grad():
-            observations = env.get_observations()
+            observations = env.get_observations().to(device)
             for _ in range(config.horizon):
-                observations, rewards, dones, extras = env.step(ppo.act(observations))
+                seen, rewards, dones, extras = env.step(ppo.act(observations).cpu())
+                observations = seen.to(device)
                 # Scaled so that the value of an undisturbed state is about 1.
-                ppo.process_env_step(observations, (1 - config.gamma) * rewards, dones, extras)
+                scaled = (1 - config.gamma) * rewards
+                ppo.process_env_step(observations, scaled.to(device), dones.to(device), extras)
                 total += float(rewards.mean())
                 survived += int(extras["time_outs"].sum())
                 fell += int(env.failures.sum())
@@ -115,11 +124,13 @@ class Training:
         path = self.folder / "last.pt"
         if not path.is_file():
             return False
-        state = torch.load(path, weights_only=True)
+        state = torch.load(path, weights_only=True, map_location="cpu")
         self.ppo.load(state["ppo"], None, strict=True)
         self.iteration, self.samples, self.best = state["iteration"], state["samples"], state["best"]
         self.env.load_state_dict(state["env"])
         torch.set_rng_state(state["torch_rng"])
+        if self.device.type == "cuda" and len(dice := state.get("cuda_rng", ())):
+            torch.cuda.set_rng_state(dice, self.device)
         if self.rank > 0:  # the checkpoint holds the first process's dice: the others get their own
             torch.manual_seed(self.config.seed + self.rank + self.iteration)
             self.env.rng = np.random.default_rng([self.config.seed, self.rank, self.iteration])
@@ -133,7 +144,8 @@ class Training:
     def start_from(self, checkpoint: Path) -> None:
         """Take the networks and the optimiser of another run; samples and curve begin at zero. Raises Sim2realError."""
         try:
-            self.ppo.load(torch.load(checkpoint, weights_only=True)["ppo"], None, strict=True)
+            state = torch.load(checkpoint, weights_only=True, map_location="cpu")
+            self.ppo.load(state["ppo"], None, strict=True)
         except Exception as error:  # torch has no common base for what a wrong file raises
             reason = str(error).splitlines()[0]
             raise Sim2realError(
@@ -152,6 +164,7 @@ class Training:
             "best": self.best,
             "env": self.env.state_dict(),
             "torch_rng": torch.get_rng_state(),
+            "cuda_rng": torch.cuda.get_rng_state(self.device) if self.device.type == "cuda" else torch.empty(0),
         }
         torch.save(state, self.folder / f"{name}.part")
         os.replace(self.folder / f"{name}.part", self.folder / name)
@@ -164,6 +177,19 @@ class Training:
             "revision": git_revision(),
             "tools": {name: version(name) for name in tools},
         }
+
+
+def learner_device(name: str) -> torch.device:
+    """Where the learner of this process is: ``name``, and of several GPUs each process under torchrun has its own. Raises
+    Sim2realError."""
+    if name == "cpu":
+        return torch.device(name)
+    if name != "cuda" or not torch.cuda.is_available():
+        found = f"torch {torch.__version__} finds no GPU" if name == "cuda" else "no such device"
+        raise Sim2realError(
+            f"device: got '{name}', but {found}; expected 'cpu', or 'cuda' with a torch and a driver for it"
+        )
+    return torch.device(name, int(os.environ.get("LOCAL_RANK", 0)) % torch.cuda.device_count())
 
 
 def make_ppo(config: Any, env: Any, actor: dict, critic: dict, sees: dict[str, list[str]]) -> PPO:
@@ -181,7 +207,7 @@ def make_ppo(config: Any, env: Any, actor: dict, critic: dict, sees: dict[str, l
         "multi_gpu": {"global_rank": rank, "local_rank": rank, "world_size": world} if world > 1 else None,
     }
     with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints the networks
-        ppo: PPO = PPO.construct_algorithm(env.get_observations(), env, settings, "cpu")
+        ppo: PPO = PPO.construct_algorithm(env.get_observations(), env, settings, str(learner_device(config.device)))
     with torch.no_grad():
         last = [m for m in ppo.actor.mlp.modules() if isinstance(m, nn.Linear)][-1]
         last.weight.mul_(0.01)  # start with no action at all
@@ -199,7 +225,7 @@ def read_checkpoint(path: Path, make: Callable[[dict[str, Any]], Any]) -> tuple[
     """A checkpoint's state, and its settings as ``make`` makes them of the document. Raises Sim2realError."""
     if not path.is_file():
         raise Sim2realError(f"{path}: no such checkpoint; train first: sim2real train --help lists the tasks")
-    state = torch.load(path, weights_only=True)
+    state = torch.load(path, weights_only=True, map_location="cpu")
     return state, settings(state.get("config", {}), make, path)
 
 

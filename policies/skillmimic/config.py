@@ -14,6 +14,7 @@ class SkillMimic:
     seed: int = 1
     envs: int = 512
     threads: int = 2  # of the physics; the networks have one more
+    device: str = "cpu"  # of the learner; "cuda": a GPU
     # what is learned
     skills: tuple[str, ...] = ("hold",)
     clips: tuple[str, ...] = ("hold_05",)  # only these of them, by name; none: all

@@ -47,7 +47,7 @@ class SkillTraining(training.Training):
 
     def graph(self) -> PolicyGraph:
         graph = self.env.graph
-        graph.actor = self.ppo.actor.mlp
+        graph.actor = self.beside_physics(self.ppo.actor.mlp)
         return graph.eval()
 
 

@@ -26,6 +26,8 @@ class Args:
     """robots simulated at once"""
     threads: int | None = None
     """threads of the physics"""
+    device: Literal["cpu", "cuda"] | None = None
+    """of the learner; the physics are the CPU's"""
     seed: int | None = None
     """of everything random"""
     start: Path | None = None
@@ -39,7 +41,7 @@ class Args:
 def main(argv: list[str]) -> int:
     args = tyro.cli(Args, args=argv, prog="sim2real train")
     folder = args.folder or Path("runs") / args.task
-    given = {k: getattr(args, k) for k in ("samples", "envs", "threads", "seed", "variant")}
+    given = {k: getattr(args, k) for k in ("samples", "envs", "threads", "device", "seed", "variant")}
     if args.practise:
         given["practise"] = (args.practise,)
     training_side("policies.train").train_command(

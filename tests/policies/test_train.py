@@ -11,6 +11,7 @@ import torch
 
 from policies.basics import Basics
 from policies.train import Training, load_config, load_graph
+from policies.training import learner_device
 from sim2real.types import Sim2realError
 
 SHIPPED = Path(__file__).resolve().parents[2] / "policies" / "g1" / "basics.pt"
@@ -56,6 +57,37 @@ def test_a_run_leaves_its_config_and_curve(tmp_path):
     assert curve == rows and [r["samples"] for r in curve] == [32, 64, 96, 128]
     graph = load_graph(tmp_path, "last.pt")
     assert graph.actor(torch.zeros(1, *graph.outputs()["observation"])).shape == (1, 15)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch finds no GPU")
+def test_a_learner_on_a_gpu_leaves_checkpoints_that_a_cpu_reads_and_goes_on_from(tmp_path):
+    there = Training(dataclasses.replace(TINY, device="cuda", evaluate_every=1), tmp_path)
+    there.run()
+    assert {p.device.type for p in parameters(there).values()} == {"cuda"}
+    graph = load_graph(tmp_path)
+    assert {p.device.type for p in graph.actor.parameters()} == {"cpu"}
+    here = Training(TINY, tmp_path)
+    assert here.resume()
+    for name, value in parameters(there).items():
+        torch.testing.assert_close(parameters(here)[name], value.cpu())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(Sim2realError, match="device: got 'cuda', but torch .* finds no GPU; expected 'cpu'"):
+        Training(dataclasses.replace(TINY, device="cuda"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(Sim2realError, match="device: got 'tpu', but no such device"):
+        learner_device("tpu")
+
+
+def test_networks_of_a_learner_elsewhere_are_copied_beside_the_physics(tmp_path):
+    training = Training(TINY, tmp_path)
+    network = training.ppo.actor.mlp
+    assert training.beside_physics(network) is network
+    training.device = torch.device("cuda")
+    copied = training.beside_physics(network)
+    assert copied is not network and {p.device.type for p in copied.parameters()} == {"cpu"}
 
 
 def test_no_checkpoint_is_refused_with_the_next_step(tmp_path):
