@@ -24,6 +24,7 @@ from policies.skillmimic.rewards import SENSITIVITIES, VARIANTS
 from policies.skillmimic.train import SkillTraining, load_graph
 
 FOLDER = Path("runs/ablation")
+# Steps of a learner that has everything to find, and is to have found some of it after 0.2 M samples.
 LARGE = {"frames": 150, "push_chance": 0.01, "learning_rate": 5e-4, "std": 0.15}
 HEAD = "What the contact graph and the product of rewards are worth"
 NOTE = """Written by `python -m policies.skillmimic.ablation`; do not edit. The paper's Table 1: one skill, one reward each

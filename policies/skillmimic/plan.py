@@ -26,9 +26,8 @@ KNOTS = 8  # of a skill that moves
 # The furthest that palms follow the ball: m forwards, left, up; rad tipped forwards, left.
 REACH = np.array([0.15, 0.15, 0.25, 0.5, 0.5])
 TIPS = slice(3, 5)  # of these
-RESTED = (
-    8.0  # ticks that feet rest until it counts: who has just made a step still sways, and a ball flies off with that
-)
+# Ticks that feet rest until it counts: who has just made a step still sways, and a ball that is let go flies off with that.
+RESTED = 8.0
 SETTLE = 17.0  # rows for which they go on resting before legs bend
 LOST = 0.4  # m from its plan: a ball farther away does not come back
 SLOW = 0.5  # m/s: a ball slower than this says little about the time
