@@ -120,7 +120,7 @@ def train_command(task: str, folder: Path, start: Path | None = None, **settings
     resumed = run.resume()
     if start is not None and not resumed:
         run.start_from(start)
-    console = Console()
+    console = Console(quiet=run.rank > 0)  # of several processes one tells
     console.print(
         f"{'resuming' if resumed else 'training'} in {folder}: {run.env.num_envs} robots, "
         f"{run.samples / 1e6:.1f} of {run.config.samples / 1e6:.1f} M samples done"
@@ -139,4 +139,10 @@ def train_command(task: str, folder: Path, start: Path | None = None, **settings
                 console.print(f"{row['samples'] / 1e6:6.2f} M samples: {each}")
 
         run.run(report)
-    console.print(f"best: {run.best:.1%}, {folder / 'best.pt'}; next: sim2real export {folder} -o FILE.onnx")
+    if run.best >= 0:
+        console.print(f"best: {run.best:.1%}, {folder / 'best.pt'}; next: sim2real export {folder} -o FILE.onnx")
+    else:
+        console.print(
+            f"never evaluated, which happens every {run.config.evaluate_every} iterations: no {folder / 'best.pt'};"
+            f" next: give it more --samples, it goes on from {folder / 'last.pt'}"
+        )

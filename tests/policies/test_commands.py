@@ -42,6 +42,23 @@ def test_train_trains_evaluates_itself_and_resumes(capsys, tmp_path):
     assert len((run / "curve.jsonl").read_text().splitlines()) == 4
 
 
+def test_a_run_too_short_to_be_evaluated_names_no_best_policy(capsys, tmp_path):
+    (tmp_path / "config.json").write_text(
+        json.dumps({"config": dataclasses.asdict(dataclasses.replace(TINY, evaluate_every=1000))})
+    )
+    assert main(["train", "g1-basics", "--folder", str(tmp_path)]) == 0
+    told = "".join(capsys.readouterr().out.split())
+    assert "neverevaluated,whichhappensevery1000iterations" in told and "best:" not in told
+    assert not (tmp_path / "best.pt").exists()
+
+
+def test_of_several_processes_one_tells(capsys, tmp_path, monkeypatch):
+    monkeypatch.setattr(train.Training, "resume", lambda self: setattr(self, "rank", 1))
+    (tmp_path / "config.json").write_text(json.dumps({"config": dataclasses.asdict(TINY)}))
+    assert main(["train", "g1-basics", "--folder", str(tmp_path)]) == 0
+    assert not capsys.readouterr().out.strip()
+
+
 def test_settings_of_another_version_are_named(tmp_path):
     train.Training(dataclasses.replace(TINY, samples=0), tmp_path).run()
     document = (tmp_path / "config.json").read_text()
