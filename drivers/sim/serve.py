@@ -225,7 +225,10 @@ class Server:
         name = self._clients[sock]
         try:
             data = sock.recv(DATAGRAM)
-        except BlockingIOError:
+        except (
+            BlockingIOError,
+            ConnectionResetError,
+        ):  # reset: it left answers unread; what it said last is still there
             return
         except OSError:
             data = b""
@@ -264,9 +267,8 @@ class Server:
             sock.send(data)
         except BlockingIOError:
             self.pace.unread += 1
-        except OSError:
-            self._clients.pop(sock, None)
-            sock.close()
+        except OSError:  # it has gone: ``_hear`` takes in what it said last, and lets go of it
+            pass
 
     def _call(self, data: bytes) -> bytes:
         try:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import select
+import signal
 import subprocess
 import sys
 import threading
@@ -110,6 +112,21 @@ def test_hosts_come_and_go(served):
     one, two = SocketCanWire(folder / "arm.sock"), SocketCanWire(folder / "arm.sock")
     send(one, (REGISTER, REFRESH))
     assert len(hear(one, 1)) == len(hear(two, 1)) == 1  # everybody on a bus hears everything
+
+
+def test_what_a_host_said_last_is_heard_though_it_left_answers_unread(served):
+    """As a guardian does that switches its motors off and ends."""
+    folder, process = served
+    wire, world = SocketCanWire(folder / "arm.sock"), WorldRemote(folder / "world.sock")
+    send(wire, (REGISTER, REFRESH))
+    until(lambda: select.select([wire], [], [], 0)[0])
+    process.send_signal(signal.SIGSTOP)  # it hears nothing until all is said
+    for _ in range(100):  # and answers, to nobody, before it has heard it all
+        send(wire, (REGISTER, REFRESH))
+    send(wire, (1, ENABLE))
+    wire.close()
+    process.send_signal(signal.SIGCONT)
+    until(lambda: "enabled" in [e.event for e in world.motor_log])
 
 
 def test_world_by_its_names_from_afar(served):
