@@ -225,11 +225,8 @@ class Server:
         name = self._clients[sock]
         try:
             data = sock.recv(DATAGRAM)
-        except (
-            BlockingIOError,
-            ConnectionResetError,
-        ):  # reset: it left answers unread; what it said last is still there
-            return
+        except (BlockingIOError, ConnectionResetError):
+            return  # reset: it went with answers unread, and what it said last is still there
         except OSError:
             data = b""
         if not data:

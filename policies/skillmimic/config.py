@@ -97,7 +97,7 @@ BALL = {  # a clip each: the calmest, and those that come from and go to the fro
     "bounce_walk": "bounce_walk_01",
 }
 WALKS = {"carry": None, "bounce_walk": ((0.1, -0.1, -0.3), (0.3, 0.1, 0.3))}
-# Small steps from a plan that works: few pushes, little noise, and a look every few iterations at what is best.
+# Small steps from a plan that works; each task then looks every few iterations at what is best.
 GENTLE = SkillMimic(corrections=PLAN, push_chance=0.004, learning_rate=3e-4, std=0.1)
 TASKS: dict[str, SkillMimic] = {
     "g1-ball": replace(GENTLE, base=BASE, skills=tuple(BALL), clips=tuple(BALL.values()), walks=WALKS, frames=200,

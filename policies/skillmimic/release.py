@@ -21,8 +21,9 @@ from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.plan import RESTED, SETTLE, samples
 from policies.skillmimic.starts import approach, first_clips, object_start, start_posture
-from policies.skillmimic.train import load_graph
+from policies.skillmimic.train import load_graph, skills
 from policies.training import git_revision
+from policies.training import settings as read_settings
 from sim2real.contract import Contract
 from sim2real.policy import Policy
 from sim2real.types import Sim2realError
@@ -121,12 +122,12 @@ def settings(config: SkillMimic) -> str:
 
 
 def graph_of(contract: Contract) -> PolicyGraph:
-    """The graph that ``contract``'s file was exported from, without its actor. Raises Sim2realError where it does not say."""
+    """The graph that ``contract``'s file was exported from, without its actor. Raises Sim2realError where it does not say, or
+    is of another version."""
     text = contract.provenance.training.get("settings")
     if not isinstance(text, str):
         raise Sim2realError(f"{contract.name}: its provenance has no 'settings': export it again (sim2real export)")
-    fields = {name: tuple(v) if isinstance(v, list) else v for name, v in json.loads(text).items()}
-    return PolicyGraph(SkillMimic(**fields))
+    return PolicyGraph(read_settings(json.loads(text), skills, Path(contract.name)))
 
 
 def network_in(path: Path) -> nn.Module:

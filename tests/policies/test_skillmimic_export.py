@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import mujoco
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from policies.skillmimic.starts import object_start
 from policies.skillmimic.through_bytes import deploy_episode
 from sim2real.object.camera import CameraModel
 from sim2real.policy import load_policy
+from sim2real.types import Sim2realError
 
 
 @pytest.fixture(scope="module")
@@ -56,6 +59,16 @@ def test_the_file_says_what_it_was_made_of(graph, file):
     torch.testing.assert_close(again.postures, graph.postures)
     assert again.clips.names == graph.clips.names
     assert contract.object is not None and contract.object.radius == RADIUS
+
+
+@pytest.mark.slow
+def test_a_file_of_another_version_is_named(file):
+    contract = load_policy(file, trial=0).contract
+    made = json.loads(contract.provenance.training["settings"]) | {"borrows": {}}
+    training = contract.provenance.training | {"settings": json.dumps(made)}
+    older = contract.model_copy(update={"provenance": contract.provenance.model_copy(update={"training": training})})
+    with pytest.raises(Sim2realError, match="its settings are of another version.*borrows"):
+        graph_of(older)
 
 
 @pytest.mark.slow
