@@ -112,10 +112,11 @@ class Tuning:
         return ", ".join(words) or "untuned"
 
 
+SPIN = 150e-6  # s of busy-waiting before each deadline: what a sleeping process may wake up late
 _held: list[int] = []  # file descriptors kept open for as long as the process lives
 
 
-def tune(priority: int = 80, cpu: int | None = None, spin: float = 150e-6) -> Tuning:
+def tune(priority: int = 80, cpu: int | None = None, spin: float = SPIN) -> Tuning:
     """Ask for everything that makes a Python loop punctual; take what is permitted. Never raises.
 
     SCHED_FIFO, one CPU, locked memory, no deep idle states, no garbage collector. Call it after warm-up, in a process
