@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from heapq import heapify, heappop, heappush
+from itertools import repeat
 from typing import Protocol
 
 import numpy as np
@@ -112,11 +113,12 @@ class SimCan:
         self.sent: list[tuple[float, bytes]] = []  # by the host, not yet timed: (ready, raw frames)
         self.inbox: deque[tuple[float, bytes]] = deque()  # (arrival at the host, raw frame)
         self.carried: list[bytes] = []  # raw frames since the last ``digest``
+        self._label = b"%d:" % index  # of them in the digest
         self._motors, self._latency, self._reply_delay, self._room = motors, latency, reply_delay, queue_length
         self._bit = 1.0 / spec.bitrate
         self._queue: deque[tuple] = deque()  # the host's: (ready, key, id, raw, bits, tries)
-        self._waiting: deque[tuple] = deque()  # answers to come, sorted: (ready, key, order, raw, bits, row, tries)
-        self._contending: list[tuple] = []  # heap of answers that want the wire: (key, order, raw, bits, row, tries)
+        self._contending: list[tuple] = []  # heap of answers that want the wire: (key, order, answer, tries)
+        self._waiting: deque[tuple] = deque()  # answers to come, sorted: (ready, what is then in the heap)
         self._free = 0.0  # when the wire is idle again
         self._order = 0
         self._errors = 0  # the host's transmit error counter
@@ -155,9 +157,9 @@ class SimCan:
 
     def recv(self, now: float) -> np.ndarray:
         """Frames (``frame``, (n,)) that have reached the host by ``now``."""
-        inbox = self.inbox
+        inbox, due = self.inbox, now + TOLERANCE
         raws: list[bytes] = []
-        while inbox and inbox[0][0] <= now + TOLERANCE:
+        while inbox and inbox[0][0] <= due:
             raws.append(inbox.popleft()[1])
         return np.frombuffer(b"".join(raws), self.frame)
 
@@ -176,13 +178,16 @@ class SimCan:
         """Frames of the host, whose length on the wire is now known, enter its controller's queue."""
         size = self.frame.itemsize
         raws = [raw[at : at + size] for at in range(0, len(raw), size)]
-        self._queue.extend([(ready, priority(id), id, r, n, 0) for id, r, n in zip(ids, raws, bits, strict=True)])
+        self._queue.extend(zip(repeat(ready), map(priority, ids), ids, raws, bits, repeat(0)))
 
     def say(self, ready: float, answer: tuple[int, int, bytes, int]) -> None:
-        """A motor wants to send a frame (row, key, raw frame, bits) from ``ready`` on, without having been asked."""
-        row, key, raw, bits = answer
+        """A motor wants to send a frame (row, key, raw frame, bits) from ``ready`` on: asked, or by itself."""
         self._order += 1
-        insort(self._waiting, (ready, key, self._order, raw, bits, row, 0))
+        item = (ready, (answer[1], self._order, answer, 0))
+        if self._waiting and self._waiting[-1] > item:  # behind one that comes later
+            insort(self._waiting, item)
+        else:
+            self._waiting.append(item)
 
     @property
     def busy(self) -> bool:
@@ -197,10 +202,10 @@ class SimCan:
     def carry(self, until: float) -> None:
         """Let the wire work until ``until``: every frame that ends by then is delivered."""
         queue, waiting, contending, powered = self._queue, self._waiting, self._contending, self._motors.powered
-        receive, bus, delay, bit = self._motors.receive, self.index, self._reply_delay, self._bit
+        receive, say, bus, delay, bit = self._motors.receive, self.say, self.index, self._reply_delay, self._bit
         faults = [f for f in self._faults if f[0].start < until and f[0].end > self._free] if self._faults else ()
         deaf = self._motors.deaf[bus]
-        if (self._host_faults or self._away_until > self._free or deaf or not all(powered)) and self._stalls(until):
+        if (self._host_faults or self._away_until > self._free or deaf or False in powered) and self._stalls(until):
             return
         traffic, carried, inbox, latency = self.traffic, self.carried, self.inbox, self._latency
         while True:
@@ -214,7 +219,7 @@ class SimCan:
             if start >= until:
                 return
             while waiting and waiting[0][0] <= start:
-                heappush(contending, waiting.popleft()[1:])
+                heappush(contending, waiting.popleft()[1])
             self._free = start
             if queue and queue[0][0] <= start and (not contending or queue[0][1] < contending[0][0]):
                 _, _, id, raw, bits, tries = queue[0]
@@ -237,38 +242,35 @@ class SimCan:
                     self._errors -= 1
                     if self._passive and self._errors < PASSIVE_COUNT:
                         self._passive = False
-                for _ in range(copies):
+                while copies:
+                    copies -= 1
                     answer = receive(bus, id, raw, end)
                     if answer is not None:
-                        row, key, reply, bits = answer
-                        self._order += 1
-                        item = (end + delay, key, self._order, reply, bits, row, 0)
-                        if waiting and waiting[-1] > item:  # behind one that a fault holds back
-                            insort(waiting, item)
-                        else:
-                            waiting.append(item)
+                        say(end + delay, answer)
             else:
-                _, _, raw, bits, row, tries = contending[0]
+                key, order, answer, tries = contending[0]
+                row, _, raw, bits = answer
                 end = start + bits * bit
                 if end > until:
                     return
-                key, order, raw, bits, row, tries = heappop(contending)
+                heappop(contending)
                 if not powered[row]:
                     continue
                 if deaf and self._jammed(deaf, start, bits):
                     if tries < BUS_OFF_TRIES:
-                        insort(waiting, (self._free, key, order, raw, bits, row, tries + 1))
+                        insort(waiting, (self._free, (key, order, answer, tries + 1)))
                     continue
                 copies = 1
                 if faults:
-                    copies, raw = self._spoil_feedback(faults, start, key, raw, bits, row, tries)
+                    copies, raw = self._spoil_feedback(faults, start, key, answer, tries)
                     if copies is None:
                         continue
                 self._free = end
                 traffic.busy += end - start
                 traffic.frames += 1
                 carried.append(raw)
-                for _ in range(copies):
+                while copies:
+                    copies -= 1
                     inbox.append((end + latency, raw))
 
     def away(self, now: float) -> bool:
@@ -384,9 +386,10 @@ class SimCan:
                 return None
         return copies
 
-    def _spoil_feedback(self, faults, start, key, raw, bits, row, tries) -> tuple[int | None, bytes]:
+    def _spoil_feedback(self, faults, start, key, answer, tries) -> tuple[int | None, bytes]:
         """How often a motor's frame is heard (None: it was not carried), and what it says by then."""
         copies: int | None = 1
+        row, _, raw, bits = answer
         for fault in self._hits(faults, start, row):
             if fault.kind == "drop":
                 copies = 0
@@ -394,12 +397,12 @@ class SimCan:
             elif fault.kind == "duplicate":
                 copies = 2
             elif fault.kind == "delay" and tries == 0:
-                insort(self._waiting, (start + fault.value, key, self._order, raw, bits, row, 1))
+                insort(self._waiting, (start + fault.value, (key, self._order, answer, 1)))
                 return None, raw
             elif fault.kind == "corrupt":
                 self._break_off(start, bits)
                 if tries < BUS_OFF_TRIES:
-                    insort(self._waiting, (self._free, key, self._order, raw, bits, row, tries + 1))
+                    insort(self._waiting, (self._free, (key, self._order, answer, tries + 1)))
                 return None, raw
             elif fault.kind in FEEDBACK:
                 raw = self._lie(fault, row, raw)
@@ -424,14 +427,14 @@ class SimCan:
     def forget(self, row: int) -> None:
         """A motor lost its power: what it wanted to say is gone."""
         self._upset.pop(row, None)
-        self._waiting = deque(w for w in self._waiting if w[5] != row)
-        self._contending = [c for c in self._contending if c[4] != row]
+        self._waiting = deque(w for w in self._waiting if w[1][2][0] != row)
+        self._contending = [c for c in self._contending if c[2][0] != row]
         heapify(self._contending)
 
     def digest(self, sha: hashlib._Hash) -> None:
         """Add what was carried since the last call, in its order."""
         if self.carried:
-            sha.update(b"%d:" % self.index + b"".join(self.carried))
+            sha.update(self._label + b"".join(self.carried))
             self.carried.clear()
 
 

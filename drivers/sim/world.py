@@ -147,19 +147,20 @@ class World:
 
     def _price(self) -> None:
         """Give every frame that hosts sent its length on the wire, all in one pass."""
-        sent = [(bus, ready, raw) for bus in self.buses for ready, raw in bus.sent]
-        if not sent:
+        talking = [bus for bus in self.buses if bus.sent]
+        if not talking:
             return
-        raws = b"".join([raw for _, _, raw in sent])
+        raws = b"".join([raw for bus in talking for _, raw in bus.sent])
         bits = self.motors.refresh(raws)
         frame = self.buses[0].frame
         ids = np.frombuffer(raws, frame)["id"].tolist()
         at = 0
-        for bus, ready, raw in sent:
-            end = at + len(raw) // frame.itemsize
-            bus.take(ready, raw, ids[at:end], bits[at:end])
+        for bus in talking:
+            for ready, raw in bus.sent:
+                end = at + len(raw) // frame.itemsize
+                bus.take(ready, raw, ids[at:end], bits[at:end])
+                at = end
             bus.sent.clear()
-            at = end
 
     @property
     def next_substep(self) -> float:
