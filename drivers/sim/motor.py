@@ -166,9 +166,12 @@ class SimMotors:
         """The feedback (FRAME, (n,)) of every motor."""
         raise NotImplementedError
 
-    def _obey(self, rows: np.ndarray, frames: np.ndarray) -> None:
-        """Take over the commands ``frames`` (FRAME, (m,)) to motors ``rows`` (m,), in their order."""
+    def _obey(self, rows: np.ndarray, frames: np.ndarray) -> bool:
+        """Take over the commands ``frames`` (FRAME, (m,)) to motors ``rows`` (m,), in their order. Returns whether they may
+        ask for something else than those before: a policy is slower than its bus, so most commands are repeated."""
+        before = self._last[rows].tobytes()
         self._last[rows] = frames
+        return frames.tobytes() != before
 
     def _targets(self) -> MotorCommand:
         """What each motor is told to do, in its own sign and zero."""
@@ -244,12 +247,12 @@ class SimMotors:
         told, raws, when = zip(*self._arrived, strict=True)
         self._arrived.clear()
         rows, times = np.array(told), np.array(when)
-        self._obey(rows, np.frombuffer(b"".join(raws), self.frame))
+        differ = self._obey(rows, np.frombuffer(b"".join(raws), self.frame))
+        self._changed |= differ or not self._commanded[rows].all()
         self.last_command_time[rows] = times
         self._fed[rows] = times
         self._commanded[rows] = True
         self._since[rows] = times
-        self._changed = True
         self._deadline = min(self._deadline, min(when) + self._shortest)
 
     def _decide(self) -> np.ndarray:

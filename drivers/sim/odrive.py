@@ -150,13 +150,14 @@ class SimOdrive(SimMotors):
     def refresh(self, raw: bytes = b"") -> list[int]:
         return self._frame_bits(np.frombuffer(raw, FRAME)).tolist() if raw else []
 
-    def _obey(self, rows: np.ndarray, frames: np.ndarray) -> None:
+    def _obey(self, rows: np.ndarray, frames: np.ndarray) -> bool:
         inputs = np.ascontiguousarray(frames["data"]).view(odrive.INPUT_POS)[:, 0]
         sound = np.isfinite(inputs["position"])
         mine = rows[sound]
         self._inputs[0, mine] = inputs["position"][sound]
         self._inputs[1, mine] = inputs["velocity"][sound] * odrive.THOUSANDTH
         self._inputs[2, mine] = inputs["torque"][sound] * odrive.THOUSANDTH
+        return True
 
     def _targets(self) -> MotorCommand:
         column = lambda name: np.array([r[name] for r in self._registers])  # noqa: E731

@@ -158,7 +158,7 @@ class SimRecoil(SimMotors):
         self._changed = True
         self._set_deadline()
 
-    def _obey(self, rows: np.ndarray, frames: np.ndarray) -> None:
+    def _obey(self, rows: np.ndarray, frames: np.ndarray) -> bool:
         for row, frame in zip(rows, frames, strict=True):
             first, second = self._codec.unpack_targets(frame)
             if not np.isfinite([first, second]).all():
@@ -166,6 +166,7 @@ class SimRecoil(SimMotors):
             self._target[0, row] = first
             if int(frame["id"]) >> recoil.FUNCTION_SHIFT == Function.RPDO3:
                 self._target[1, row] = second
+        return True
 
     def _targets(self) -> MotorCommand:
         column = lambda name: np.array([r[name] for r in self._registers])  # noqa: E731

@@ -227,6 +227,9 @@ def test_an_old_command_does_not_survive_a_stop(host):
     host.ask(1, ENABLE)
     host.wait(0.02)
     assert host.world.plant.joint_torque[0] == 0.0
+    host.command(torque=2.0, ids=(1,))
+    host.wait(0.004)
+    assert host.world.plant.joint_torque[0] == pytest.approx(2.0, abs=0.02)  # told again, it obeys again
 
 
 def test_a_command_too_late_for_the_watchdog_does_nothing(host):
