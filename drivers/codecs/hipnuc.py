@@ -13,9 +13,7 @@ import binascii
 import math
 import struct
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeAlias
-
-import numpy as np
+from typing import NamedTuple, TypeAlias
 
 GRAVITY = 9.80665  # m/s^2 in the maker's "1 g"
 HEAD = b"\x5a\xa5"
@@ -28,7 +26,7 @@ TAG = 0x91
 PAYLOAD = struct.Struct("<BHbfI3f3f3f3f4f")  # 76 bytes
 
 
-Vector: TypeAlias = Any  # np.ndarray, or to ``pack`` any sequence of floats
+Vector: TypeAlias = Sequence[float]
 
 
 class Hi91(NamedTuple):
@@ -42,7 +40,7 @@ class Hi91(NamedTuple):
     status: int
 
 
-def crc16(data: bytes, crc: int = 0) -> int:
+def crc16(data: bytes | bytearray, crc: int = 0) -> int:
     """CRC-16/XMODEM of ``data``, continuing from ``crc``."""
     return binascii.crc_hqx(data, crc)
 
@@ -56,7 +54,7 @@ def pack(packet: Hi91) -> bytes:
         round(packet.temperature),
         0.0,
         round(packet.timestamp * 1e3) & 0xFFFF_FFFF,
-        *(a / GRAVITY for a in packet.acceleration),
+        *[a / GRAVITY for a in packet.acceleration],
         *map(math.degrees, packet.angular_velocity),
         *(0.0, 0.0, 0.0),
         math.degrees(math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))),
@@ -73,17 +71,16 @@ def frame(payload: bytes) -> bytes:
     return start + crc16(payload, crc16(start)).to_bytes(2, "little") + payload
 
 
-def unpack(payload: bytes) -> Hi91:
+def unpack(payload: bytes | bytearray) -> Hi91:
     """A checked payload whose first byte is TAG, in SI units. Raises ValueError if it is shorter than PAYLOAD."""
     if len(payload) < PAYLOAD.size:
         raise ValueError(f"payload: got {len(payload)} bytes, expected {PAYLOAD.size}")
-    _, status, temperature, _, timestamp, *vectors = PAYLOAD.unpack_from(payload)
-    v = np.array(vectors)
+    _, status, temperature, _, timestamp, *v = PAYLOAD.unpack_from(payload)
     return Hi91(
         timestamp=timestamp * 1e-3,
         temperature=float(temperature),
-        acceleration=v[0:3] * GRAVITY,
-        angular_velocity=np.deg2rad(v[3:6]),
+        acceleration=[GRAVITY * a for a in v[0:3]],
+        angular_velocity=[*map(math.radians, v[3:6])],
         orientation=v[12:16],
         status=status,
     )
@@ -114,8 +111,8 @@ class Parser:
                 continue
             if len(buffer) < end:
                 break
-            payload = bytes(buffer[at + HEAD_SIZE : end])
-            if crc16(payload, crc16(bytes(buffer[at : at + 4]))) != int.from_bytes(buffer[at + 4 : at + 6], "little"):
+            payload = buffer[at + HEAD_SIZE : end]
+            if crc16(payload, crc16(buffer[at : at + 4])) != int.from_bytes(buffer[at + 4 : at + 6], "little"):
                 self.rejected += 1
                 at += len(HEAD)  # what looked like a header may hide a real one: search on right behind it
                 continue

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -12,18 +13,20 @@ from drivers.wire import SerialWire, WireError
 
 NORM_TOLERANCE = 0.01  # of a quaternion
 
+Vector: TypeAlias = Sequence[float] | np.ndarray
+
 
 class ImuPacket(Protocol):
     """What a packet must say, in SI units and the sensor's own frame."""
 
     @property
-    def orientation(self) -> np.ndarray: ...  # (4,) w, x, y, z
+    def orientation(self) -> Vector: ...  # (4,) w, x, y, z
 
     @property
-    def angular_velocity(self) -> np.ndarray: ...  # (3,) rad/s
+    def angular_velocity(self) -> Vector: ...  # (3,) rad/s
 
     @property
-    def acceleration(self) -> np.ndarray: ...  # (3,) m/s^2, +g upwards at rest
+    def acceleration(self) -> Vector: ...  # (3,) m/s^2, +g upwards at rest
 
 
 class ImuParser(Protocol):
@@ -61,15 +64,15 @@ class SerialImu:
         except WireError as error:
             raise BusError(f"imu {self.spec.protocol} ({self.spec.channel}): {error}") from error
         packets = self._parser.feed(data)
+        plausible = [p for p in packets if self._plausible(p)]
+        if plausible:
+            newest, state = plausible[-1], self._state
+            state.orientation_imu_in_world[:] = newest.orientation
+            state.angular_velocity_imu_in_imu[:] = newest.angular_velocity
+            state.acceleration_imu_in_imu[:] = newest.acceleration
+            state.time = now
         self.counters.received += len(packets)
-        for p in packets:
-            if self._plausible(p):
-                self._state.orientation_imu_in_world[:] = p.orientation
-                self._state.angular_velocity_imu_in_imu[:] = p.angular_velocity
-                self._state.acceleration_imu_in_imu[:] = p.acceleration
-                self._state.time = now
-            else:
-                self._implausible += 1
+        self._implausible += len(packets) - len(plausible)
         self.counters.rejected = self._parser.rejected + self._implausible
         return self._state
 
@@ -77,5 +80,5 @@ class SerialImu:
         self._wire.close()
 
     def _plausible(self, p: ImuPacket) -> bool:
-        measured = (*p.angular_velocity.tolist(), *p.acceleration.tolist())
-        return all(map(math.isfinite, measured)) and abs(math.hypot(*p.orientation.tolist()) - 1.0) < NORM_TOLERANCE
+        measured = (*p.angular_velocity, *p.acceleration)
+        return all(map(math.isfinite, measured)) and abs(math.hypot(*p.orientation) - 1.0) < NORM_TOLERANCE

@@ -13,6 +13,7 @@ import random
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import add
 from typing import Protocol
 
 import numpy as np
@@ -90,8 +91,8 @@ class SimImu:
         self._samples += 1
         at = self._samples % BLOCK
         if at == 1 or self._samples == 1:
-            self._block = self._generator.standard_normal((BLOCK, 9)) * self._scale + self._mean
-        body, noise = self._body, self._block[at].tolist()
+            self._block = (self._generator.standard_normal((BLOCK, 9)) * self._scale + self._mean).tolist()
+        body, noise = self._body, self._block[at]
         orientation = body.orientation_imu_in_world.tolist()
         spin, acceleration = body.angular_velocity_imu_in_imu, body.acceleration_imu_in_imu
         if self._mount is not None:
@@ -102,8 +103,8 @@ class SimImu:
         packet = self._sensor.pack(
             now,
             [w / norm, x / norm, y / norm, z / norm],
-            [a + b for a, b in zip(spin.tolist(), noise[3:6], strict=True)],
-            [a + b for a, b in zip(acceleration.tolist(), noise[6:9], strict=True)],
+            [*map(add, spin.tolist(), noise[3:6])],
+            [*map(add, acceleration.tolist(), noise[6:9])],
         )
         self._send(packet, now)
 

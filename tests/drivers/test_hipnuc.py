@@ -28,7 +28,7 @@ def test_the_example_of_the_manual():
     (packet,) = Parser().feed(EXAMPLE)
     assert packet.timestamp == pytest.approx(310.205)
     assert packet.temperature == 59
-    np.testing.assert_allclose(packet.acceleration / GRAVITY, [0.224, 0.770, 0.691], atol=5e-4)
+    np.testing.assert_allclose(np.divide(packet.acceleration, GRAVITY), [0.224, 0.770, 0.691], atol=5e-4)
     np.testing.assert_allclose(np.rad2deg(packet.angular_velocity), [-54.708, -20.077, -119.070], atol=5e-4)
     np.testing.assert_allclose(packet.orientation, [0.855, 0.310, -0.310, -0.277], atol=5e-4)
     assert np.linalg.norm(packet.orientation) == pytest.approx(1.0, abs=1e-6)
