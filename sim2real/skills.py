@@ -6,6 +6,7 @@ the pilot process, in lockstep simulation and in replay.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from pathlib import Path
@@ -309,7 +310,10 @@ class _Plan:
         self._low = np.array(contract.command_velocity_min)
         self._high = np.array(contract.command_velocity_max)
         signals = {name: shape for name, shape in contract.inputs.items() if not name.startswith(CARRY)}
-        self.inputs = {name: np.zeros(shape, np.float32) for name, shape in signals.items()}
+        sizes = [math.prod(shape) for shape in signals.values()]
+        self._values = np.zeros(sum(sizes), np.float32)  # of all inputs, which are views into it
+        *parts, _ = np.split(self._values, np.cumsum(sizes))
+        self.inputs = {n: part.reshape(shape) for (n, shape), part in zip(signals.items(), parts, strict=True)}
         if strangers := [n for n in signals if n not in _SOURCES]:
             raise Sim2realError(
                 f"{contract.name}: nothing on this robot measures {', '.join(strangers)}; it measures {', '.join(_SOURCES)}"
@@ -321,7 +325,7 @@ class _Plan:
             source(self, state, velocity, skill, out)
 
     def finite(self) -> bool:
-        return all(np.isfinite(x).all() for x in self.inputs.values())
+        return bool(np.isfinite(self._values).all())
 
 
 def _joint_pos(plan, state, velocity, skill, out):
