@@ -32,7 +32,7 @@ from sim2real.records import Layout
 from sim2real.types import Sim2realError
 
 ENVELOPE = struct.Struct("<IIIId")  # before each record: sink's id, topic, records of it dropped so far, bytes, time
-BATCH = 32 * 1024  # bytes of records that a patient sink sends at once
+BATCH = 64 * 1024  # bytes of records that a patient sink sends at once
 CHANNEL_SIZE = 8 * 1024 * 1024  # bytes asked of the kernel; it may grant less (net.core.wmem_max)
 QUEUE_LENGTH = 16384  # records in memory while the disk is slow: about 64 MB, half a minute of a G1
 FLUSH_INTERVAL = 1.0  # s, at most this much of a run is in memory when the writer is killed
