@@ -52,14 +52,10 @@ class SimClock:
     """
 
     def __init__(self, advance: Callable[[float], None], read: Callable[[], float]):
-        self._advance = advance
-        self._read = read
-
-    def now(self) -> float:
-        return self._read()
+        self._advance, self.now = advance, read
 
     def sleep_until(self, deadline: float) -> None:
-        if deadline > self._read():
+        if deadline > self.now():
             self._advance(deadline)
 
 

@@ -85,7 +85,7 @@ class Simulation:
             hang=0.02 if scene.gantry else None,
             noise=scene.noise,
         )
-        self.clock = SimClock(self.world.advance, lambda: self.world.time)
+        self.clock = SimClock(self.world.advance, self.world.now)
         joints = self.config.joint_names
         truth = TrueObject(self.world, thing.radius) if thing and scene.camera is None else None
         player = SkillPlayer(self.config, self.policies, truth)
