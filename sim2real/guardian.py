@@ -133,7 +133,7 @@ class Guardian:
         clock = self.clock
         start = clock.now()
         request = self._request()
-        calls = self._obey_operator(start) | self._failed
+        calls = self._obey_operator(start)
         command = self.safety.step(self._state, request, start)
         judged = clock.now()
         self._transmit(command)
@@ -156,8 +156,11 @@ class Guardian:
 
     def _request(self) -> JointCommand | None:
         if self.requests.read():
-            self._wish.time = float(self.requests.record["command.time"][0])
-            self._wish.object_time = float(self.requests.record["command.object_time"][0])
+            r, wish = self._fields, self._wish
+            wish.time = float(self.requests.record["command.time"][0])
+            wish.object_time = float(self.requests.record["command.object_time"][0])
+            _copy(wish, self._requested)
+            r["request.time"][0], r["request.object_time"][0] = wish.time, wish.object_time
         return self._wish if self._wish.time else None
 
     def _obey_operator(self, now: float) -> Calls:
@@ -244,8 +247,6 @@ class Guardian:
         r["mode"][0], r["limited"][0] = self.safety.mode, self.safety.limited
         r["fault"][0] = fault.rule.number if fault else 0
         r["fault_joint"][0] = fault.joint if fault else -1
-        _copy(self._wish, self._requested)
-        r["request.time"][0], r["request.object_time"][0] = self._wish.time, self._wish.object_time
         _copy(command, self._sent)
         r["command.time"][0], r["command.object_time"][0] = command.time, command.object_time
         r["timing.safety"][0], r["timing.write"][0] = judged - start, written - judged
