@@ -52,18 +52,17 @@ class Channel:
         self._sequence = np.frombuffer(buffer, _SEQUENCE, 1)
         starts = [_HEAD, _HEAD + stride]
         self._sums = [np.frombuffer(buffer, "<u4", 1, s) for s in starts]
-        self._slots = [np.frombuffer(buffer, np.uint8, self._size, s + 16) for s in starts]
-        self._bytes = self.record.view(np.uint8)
-        self._scratch = np.empty(self._size, np.uint8)
+        self._slots = [memoryview(buffer)[s + 16 : s + stride] for s in starts]
+        self._bytes = self.record.view(np.uint8).data
         self._seen = 0
 
     def write(self, record: np.ndarray) -> None:
         """Publish ``record`` (1,) of the layout's dtype. One writer only."""
         following = int(self._sequence[0]) + 1
         slot = following & 1
-        data = record.view(np.uint8)
+        data = record.tobytes()
         self._slots[slot][:] = data
-        self._sums[slot][0] = zlib.crc32(data.data)
+        self._sums[slot][0] = zlib.crc32(data)
         self._sequence[0] = following
 
     def read(self) -> bool:
@@ -73,9 +72,9 @@ class Channel:
             if sequence == self._seen:
                 return False
             slot = sequence & 1
-            self._scratch[:] = self._slots[slot]
-            if zlib.crc32(self._scratch.data) == int(self._sums[slot][0]):
-                self._bytes[:] = self._scratch
+            data = bytes(self._slots[slot])
+            if zlib.crc32(data) == int(self._sums[slot][0]):
+                self._bytes[:] = data
                 self._seen = sequence
                 return True
         return False

@@ -48,7 +48,8 @@ def test_a_half_written_slot_is_not_taken(pair):
     record["x"][:] = 1.0
     writer.write(record)
     assert reader.read()
-    writer._slots[0][:] = 255  # a writer caught in the middle: bytes changed, sequence moved, checksum not
+    torn = bytes([255]) * len(writer._slots[0])
+    writer._slots[0][:] = torn  # a writer caught in the middle: bytes changed, sequence moved, checksum not
     writer._sequence[0] += 1
     assert not reader.read()
     assert (reader.record["x"] == 1.0).all()
