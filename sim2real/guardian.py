@@ -166,14 +166,15 @@ class Guardian:
     def _obey_operator(self, now: float) -> Calls:
         calls = Calls(0)
         self.operator.read()
-        wish = self.operator.record[0]
-        if wish["quit"]:
+        wish = self.operator.record
+        if wish["quit"][0]:
             self.quit()
-        if wish["stop"] or self._ending is not None:
+        stop = bool(wish["stop"][0]) or self._ending is not None
+        if stop:
             self._enabling = None
             self.safety.stop(now)
             calls |= Calls.STOP
-        arm = bool(wish["arm"]) and self._ending is None and not wish["stop"]
+        arm = bool(wish["arm"][0]) and not stop
         if arm and not self._arm_seen and self.safety.mode != Mode.RUN:
             if self._lost.any():
                 names = ", ".join(self.robot.config.joint_names[i] for i in np.flatnonzero(self._lost))

@@ -237,7 +237,7 @@ class DamiaoTick:
         state.torque[rows] = f.torque
         state.temperature[rows] = np.maximum(f.byte6, f.byte7)
         state.enabled[rows] = status == 1
-        state.error[rows] = np.where(status > 1, status, 0)
+        state.error[rows] = status * (status > 1)
         state.time[rows] = now
 
 

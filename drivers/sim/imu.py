@@ -131,8 +131,9 @@ class SimImu:
             else:
                 packet = self._lie(fault.kind, packet)
         for _ in range(copies):
-            self._packets.append([max(start, self._free), packet, 0])
-            self._free = max(start, self._free) + len(packet) * self._byte_time
+            start = max(start, self._free)
+            self._packets.append([start, packet, 0])
+            self._free = start + len(packet) * self._byte_time
             self.carried.append(packet)
 
     def _lie(self, kind: str, packet: bytes) -> bytes:

@@ -243,7 +243,7 @@ class Plant:
     @property
     def tilt(self) -> float:
         """rad between the base's up and the world's."""
-        return float(np.arccos(np.clip(self.data.xmat[self._base, 8], -1.0, 1.0)))
+        return float(np.arccos(min(max(self.data.xmat[self._base, 8], -1.0), 1.0)))
 
     @property
     def fallen(self) -> bool:

@@ -142,7 +142,8 @@ class SimCan:
                 if fault.kind == "no_buffer" and fault.start <= now < fault.end:
                     if self._random.random() < fault.probability:
                         self._refuse(len(frames), 0)
-        room = max(0, self._room - len(self._queue) - sum(len(raw) for _, raw in self.sent) // self.frame.itemsize)
+        unpriced = sum([len(raw) for _, raw in self.sent]) // self.frame.itemsize
+        room = max(0, self._room - len(self._queue) - unpriced)
         if room and len(frames):
             self.sent.append((now + self._latency, frames[:room].tobytes()))
         if len(frames) > room:
@@ -184,7 +185,7 @@ class SimCan:
         """A motor wants to send a frame (row, key, raw frame, bits) from ``ready`` on: asked, or by itself."""
         self._order += 1
         item = (ready, (answer[1], self._order, answer, 0))
-        if self._waiting and self._waiting[-1] > item:  # behind one that comes later
+        if self._waiting and self._waiting[-1][0] > ready:  # a fault holds that one back
             insort(self._waiting, item)
         else:
             self._waiting.append(item)
