@@ -85,7 +85,8 @@ def bits_of(spec: BusSpec) -> Callable[[np.ndarray], np.ndarray]:
 
 # A standard frame with 8 bytes has 98 bits from the start to the end of the CRC: 7 chunks of 14. The state between two
 # chunks is the last bit and how many like it came in a row (1 to 4; the fifth is followed by a stuff bit at once), and
-# tables of 8 states x 2^14 chunks tell the next state and the stuff bits. Before the frame: a 1, once.
+# tables of 8 states x 2^14 chunks tell the next state and the stuff bits. Before the frame: a 1, once. All tables are of the
+# smallest type that holds them: they share a cache with everything else that a tick looks at.
 CHUNK_BITS = 14
 CHUNK = 1 << CHUNK_BITS
 MASK = CHUNK - 1
@@ -178,7 +179,7 @@ def _extended_crc() -> np.ndarray:
     for k in range(8):
         for b in range(CHUNK_BITS):
             crc_of[k] ^= np.where(chunk >> b & 1, contribution[k * CHUNK_BITS + b], 0)
-    return crc_of.reshape(-1)
+    return crc_of.reshape(-1).astype(np.uint16)
 
 
 @cache
@@ -195,7 +196,7 @@ def _stuffing() -> tuple[np.ndarray, np.ndarray]:
         stuffed += full
         last = np.where(full, 1 - bit, bit)
         run[full] = 1
-    return (last * 4 + run - 1) * CHUNK, stuffed.astype(np.uint8)
+    return ((last * 4 + run - 1) * CHUNK).astype(np.int32), stuffed.astype(np.uint8)
 
 
 @cache
@@ -213,7 +214,7 @@ def _crc() -> np.ndarray:
     for k in range(6):
         for b in range(CHUNK_BITS):
             crc_of[k] ^= np.where(chunk >> b & 1, contribution[(5 - k) * CHUNK_BITS + b], 0)
-    return crc_of.reshape(-1)
+    return crc_of.reshape(-1).astype(np.uint16)
 
 
 @lru_cache(4096)  # short frames are questions and their answers, and these repeat themselves
