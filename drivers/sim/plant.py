@@ -185,12 +185,12 @@ class Plant:
     @property
     def joint_pos(self) -> np.ndarray:
         """(n,) rad."""
-        return self._qpos[self._qpos_at]
+        return self._qpos.take(self._qpos_at)
 
     @property
     def joint_vel(self) -> np.ndarray:
         """(n,) rad/s."""
-        return self._qvel[self._qvel_at]
+        return self._qvel.take(self._qvel_at)
 
     @property
     def joint_torque(self) -> np.ndarray:
