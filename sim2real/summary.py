@@ -91,7 +91,7 @@ class Measures:
 
     def observe(self, world: Any, tick: np.ndarray, pilot: np.ndarray, since: float) -> None:
         self._policy_ticks, self._policy_late = int(pilot["tick"][0]) + 1, int(pilot["late"][0])
-        if since < 0 or int(tick["mode"][0]) > Mode.HOLD:
+        if since < 0 or int(tick["mode"][0]) not in (Mode.RUN, Mode.HOLD):
             return
         truth = world.truth()
         self._seen_body = True
