@@ -19,7 +19,7 @@ import torch
 from policies.evaluate import Rate
 from policies.skillmimic.card import SECONDS
 from policies.skillmimic.config import TASKS, SkillMimic
-from policies.skillmimic.evaluate import Result, evaluate_skill
+from policies.skillmimic.evaluate import Result, performed
 from policies.skillmimic.rewards import SENSITIVITIES, VARIANTS
 from policies.skillmimic.train import SkillTraining, load_graph
 
@@ -118,7 +118,7 @@ def main() -> None:
         for variant in a.variants:
             folder = FOLDER / f"{a.task}-{a.skill}-{variant}-{seed}"
             train(config_of(a.task, a.skill, variant, seed, a.samples), folder)
-            found[variant].append(evaluate_skill(load_graph(folder, "last.pt"), a.skill, a.episodes, SECONDS))
+            found[variant].append(performed(load_graph(folder, "last.pt"), a.skill, a.episodes, SECONDS).result())
             print(f"{variant}, seed {seed}: {found[variant][-1].success}", flush=True)
     text = f"`{a.skill}`, {a.samples / 1e6:g} M samples a run, {a.seeds} seeds, {a.episodes} episodes each:\n\n{table(found)}\n"
     tell(text, a.report, HEAD, NOTE)

@@ -13,7 +13,7 @@ import torch
 
 from policies.evaluate import FileActor, Rate
 from policies.skillmimic.curves import PAPER, Curve, learned, read, svg
-from policies.skillmimic.evaluate import BALL_NEAR, BODY_NEAR, Result, evaluate_skill, result, rule_of
+from policies.skillmimic.evaluate import BALL_NEAR, BODY_NEAR, Episodes, Result, performed, rule_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.release import graph_of, network_in
 from policies.skillmimic.tables import CELLS, FIRST, NOMINAL, REST, SECOND, pairs, sweep, switched
@@ -114,7 +114,7 @@ def evaluate(
 
 def in_training(path: Path, label: str, episodes: int) -> Result:
     """``episodes`` of one skill of a policy file in training's world."""
-    return evaluate_skill(graph_in(path), label, episodes, SECONDS, seed=1, act=BallActor(path, episodes))
+    return performed(graph_in(path), label, episodes, SECONDS, seed=1, act=BallActor(path, episodes)).result()
 
 
 def with_balls(path: Path, label: str, each: int) -> dict[str, Rate]:
@@ -137,7 +137,7 @@ def through_bytes(
         clips = np.flatnonzero(graph.clips.skill == k)
         runs = spread(judged, [(path, int(clips[i % len(clips)]), SECONDS, camera, i) for i in range(episodes)])
         good, sums, frames = (np.array(column) for column in zip(*runs, strict=True))
-        results[label] = result(good, sums, np.maximum(frames, 1))
+        results[label] = Episodes(good, sums, np.maximum(frames, 1)).result()
     return results
 
 

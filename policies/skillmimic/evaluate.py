@@ -144,11 +144,17 @@ class Result(NamedTuple):
     contact_error: float
 
 
-def result(success: np.ndarray, sums: np.ndarray, frames: np.ndarray) -> Result:
-    """What episodes amount to: ``success`` (episodes,) in [0, 1], ``sums`` (episodes, 4) of Measures over ``frames``
-    (episodes,) each."""
-    body, ball, contact, right = (sums.sum(axis=0) / frames.sum()).tolist()
-    return Result(Rate(round(float(success.sum())), len(success)), right, body, ball, contact)
+class Episodes(NamedTuple):
+    """Of one skill, a row an episode."""
+
+    success: np.ndarray  # (episodes,) in [0, 1], by the skill's rule
+    sums: np.ndarray  # (episodes, 4) of Measures over its frames
+    frames: np.ndarray  # (episodes,) until it ended
+
+    def result(self) -> Result:
+        """What they amount to."""
+        body, ball, contact, right = (self.sums.sum(axis=0) / self.frames.sum()).tolist()
+        return Result(Rate(round(float(self.success.sum())), len(self.success)), right, body, ball, contact)
 
 
 def evaluate(
@@ -167,20 +173,7 @@ def evaluate(
     says.
     """
     chosen = skills or graph.config.skills
-    return {skill: evaluate_skill(graph, skill, episodes, seconds, push, seed, act) for skill in chosen}
-
-
-def evaluate_skill(
-    graph: PolicyGraph,
-    skill: str,
-    episodes: int,
-    seconds: float,
-    push: float = 0.0,
-    seed: int = 0,
-    act: Callable[[Env], Tensor] | None = None,
-) -> Result:
-    """As ``evaluate``, of one skill."""
-    return result(*performed(graph, skill, episodes, seconds, push, seed, act))
+    return {skill: performed(graph, skill, episodes, seconds, push, seed, act).result() for skill in chosen}
 
 
 def performed(
@@ -192,9 +185,9 @@ def performed(
     seed: int = 0,
     act: Callable[[Env], Tensor] | None = None,
     fixed: Mapping[str, np.ndarray] | None = None,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Success (episodes,) in [0, 1] by the skill's rule, and sums (episodes, 4) of Measures over frames (episodes,).
-    ``fixed``: of terms of the randomisation what they are in each episode (episodes,); NaN: drawn, as ever."""
+) -> Episodes:
+    """As ``evaluate``, of one skill. ``fixed``: of terms of the randomisation what they are in each episode (episodes,);
+    NaN: drawn, as ever."""
     env = episodes_of(graph, skill, episodes, seconds, push, seed)
     config = env.config
     if fixed:
@@ -219,7 +212,7 @@ def performed(
         succeeded(skill, Trace(*(x[:end, n] for x in everything)), config.period, ticks[clips[n]])
         for n, end in enumerate(frames)
     ]
-    return np.array(shares), sums, frames
+    return Episodes(np.array(shares), sums, frames)
 
 
 def episodes_of(graph: PolicyGraph, skill: str, episodes: int, seconds: float, push: float = 0.0, seed: int = 0) -> Env:

@@ -16,7 +16,7 @@ from policies.skillmimic.ablation import arguments, bare, pooled, tell, train
 from policies.skillmimic.card import SECONDS
 from policies.skillmimic.config import TASKS
 from policies.skillmimic.env import Env
-from policies.skillmimic.evaluate import Result, evaluate_skill
+from policies.skillmimic.evaluate import Result, performed
 from policies.skillmimic.train import load_graph
 
 FOLDER = Path("runs/mixture")
@@ -62,7 +62,7 @@ def main() -> None:
             train(dataclasses.replace(everything, practise=(skill,), samples=a.samples), folder)
             learned = ((mixed, idle), (load_graph(folder, "last.pt"), None), (mixed, None))
             for way, (graph, act) in zip(ways, learned, strict=True):
-                result = evaluate_skill(graph, skill, a.episodes, SECONDS, seed=seed, act=act)
+                result = performed(graph, skill, a.episodes, SECONDS, seed=seed, act=act).result()
                 found[skill][way].append(result)
                 print(f"{skill}, {way}, seed {seed}: {result.success}", flush=True)
     text = f"{a.samples / 1e6:g} M samples a skill, {a.seeds} seeds, {a.episodes} episodes each:\n\n{table(found)}\n"

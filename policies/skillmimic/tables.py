@@ -49,8 +49,8 @@ def sweep(graph: PolicyGraph, label: str, episodes: int, seconds: float, act: Ac
         for name, value in fixed(what, factor).items():
             terms[name][k] = value
     balls = {name: values.ravel() for name, values in terms.items()}
-    shares, _, _ = performed(graph, label, len(CELLS) * episodes, seconds, seed=2, act=act, fixed=balls)
-    good = shares.reshape(len(CELLS), episodes).sum(axis=1)
+    done = performed(graph, label, len(CELLS) * episodes, seconds, seed=2, act=act, fixed=balls)
+    good = done.success.reshape(len(CELLS), episodes).sum(axis=1)
     return {f"{what} x {f:g}": Rate(round(float(n)), episodes) for (what, f), n in zip(CELLS, good, strict=True)}
 
 

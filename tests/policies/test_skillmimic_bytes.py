@@ -15,7 +15,7 @@ from policies.clips.kinematics import multiply, rotate
 from policies.skillmimic import card
 from policies.skillmimic.card import BallActor
 from policies.skillmimic.config import TASKS
-from policies.skillmimic.evaluate import evaluate_skill, ticks_of
+from policies.skillmimic.evaluate import performed, ticks_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.stance import moved
 from policies.skillmimic.starts import approach, object_start, start_posture
@@ -62,15 +62,15 @@ def test_the_file_does_in_training_what_the_graph_does(graph, file, files, monke
     monkeypatch.setattr(card, "FILES", files)
     actor = BallActor(file, 4)
     assert len(actor.policies) == files
-    of_file = evaluate_skill(graph, "hold", 4, 0.4, act=actor)
-    of_graph = evaluate_skill(graph, "hold", 4, 0.4)
+    of_file = performed(graph, "hold", 4, 0.4, act=actor).result()
+    of_graph = performed(graph, "hold", 4, 0.4).result()
     assert of_file.success == of_graph.success and of_file.ball_error == pytest.approx(of_graph.ball_error, abs=1e-4)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("camera", [None, CameraModel()])
 def test_holding_measures_the_same_in_both_worlds(graph, file, camera):
-    there = evaluate_skill(graph, "hold", 8, 1.0)
+    there = performed(graph, "hold", 8, 1.0).result()
     judged = deploy_episode(file, graph, HOLD, 1.0, camera, seed=0)
     body, ball, _, right = judged.sums / judged.frames
     assert judged.success == 1 and judged.frames == judged.ticks == 50
