@@ -1,0 +1,135 @@
+"""Where a dribble loses its ball, bounce by bounce: ``python -m policies.skillmimic.strokes policies/g1/ball.onnx``.
+
+In the training environment, as the card measures it, and then with one cause after another taken away.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from policies import ball
+from policies.skillmimic.ablation import tell
+from policies.skillmimic.card import SECONDS, BallActor, graph_in
+from policies.skillmimic.env import BASE, FLIGHT
+from policies.skillmimic.evaluate import episodes_of
+from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.plan import GRAVITY
+from policies.skillmimic.randomisation import TABLE
+
+SHOWN = 5  # bounces
+LOW = 0.3  # m: a ball that turns below bounces
+AFTER = 2  # ticks from there until nothing touches it
+HEAD = "Where the one-handed dribble loses its ball"
+NOTE = """Written by `python -m policies.skillmimic.strokes`; do not edit. Of the robots of the card's training environment, from the
+first stroke on: how many see the ball bounce so often, how fast it then leaves the floor beside what the plan asks, and how
+far it is from its place beside the robot (medians, and half of what 68 % lie within). Nobody touches a ball whose speed falls
+by its restitution, 0.72 to 0.84, from one bounce to the next."""
+
+
+class World(NamedTuple):
+    """What is otherwise than in the card."""
+
+    still: bool = False  # the base does not move, whatever the arms do
+    fixed: Mapping[str, float] = {}  # terms of the randomisation that are alike for all
+
+
+WORLDS = {
+    "as in the card": World(),
+    "base held still": World(still=True),
+    "motors of four times the torque": World(fixed={"strength": 4.0}),
+    "liveliest ball": World(fixed={"ball_restitution": TABLE["ball_restitution"].high}),
+    "nothing random": World(fixed={n: 0.0 if "noise" in n else (t.low + t.high) / 2 for n, t in TABLE.items()}),
+}
+
+
+class Bounces(NamedTuple):
+    """Of every robot, a row a bounce; NaN where it saw no such."""
+
+    speed: np.ndarray  # (SHOWN, N) m/s off the floor
+    off: np.ndarray  # (SHOWN, N) m from its place
+
+
+def bounces(lifted: np.ndarray, rising: np.ndarray, off: np.ndarray, up: np.ndarray) -> Bounces:
+    """From what was seen of balls, a row a tick, (T, N) each: m of the centre above the floor, m/s upwards, m from its place,
+    and whether the episode goes on."""
+    came = np.zeros(up.shape, bool)
+    came[1:-AFTER] = (rising[1:-AFTER] > 0) & (rising[: -AFTER - 1] <= 0) & (lifted[1:-AFTER] < LOW) & up[1 + AFTER :]
+    found = Bounces(*np.full((2, SHOWN, up.shape[1]), np.nan))
+    number = came.cumsum(axis=0)
+    for k in range(SHOWN):
+        tick, robot = np.nonzero(came & (number == k + 1))
+        at = tick + AFTER, robot
+        found.speed[k, robot] = np.sqrt(rising[at] ** 2 + 2 * GRAVITY * np.maximum(lifted[at] - ball.RADIUS, 0))
+        found.off[k, robot] = off[at]
+    return found
+
+
+def performed(path: Path, graph: PolicyGraph, skill: str, robots: int, world: World) -> Bounces:
+    """What ``robots`` do with a policy file in ``world``, for ``SECONDS``."""
+    env = episodes_of(graph, skill, robots, SECONDS)
+    env.random.fixed = {name: np.full(robots, value) for name, value in world.fixed.items()}
+    env.reset()
+    env.episode_length_buf[:] = 0
+    qpos, qvel = env.batch.bind("qpos"), env.batch.bind("qvel")
+    act, up, place = BallActor(path, robots), np.full(robots, True), qpos[:, BASE].copy()
+    rows = []
+    with torch.no_grad():
+        while up.any() and len(rows) < env.max_episode_length:
+            if world.still:
+                qpos[:, BASE], qvel[:, :6] = place, 0.0
+            env.step(act(env))
+            up = up & ~env.failures
+            here, there = env.now.state, env.now.reference
+            off = np.linalg.norm((here.object_position - there.object_position)[:, :2], axis=1)
+            rows.append((env.lifted, here.object_velocity[:, 2], off, up))
+    return bounces(*(np.stack(column) for column in zip(*rows, strict=True)))
+
+
+def table(found: Mapping[str, Bounces], planned: float) -> str:
+    """Markdown, a row a world and bounce; ``planned`` m/s: how fast the plan has the ball leave the floor."""
+    rows = []
+    for world, b in found.items():
+        for k, (speed, off) in enumerate(zip(b.speed, b.off, strict=True)):
+            there = ~np.isnan(speed)
+            if there.any():
+                rows.append(
+                    f"| {world} | {k + 1} | {there.mean():.0%} | {_spread(speed[there] - planned)} | {_spread(off[there])} |"
+                )
+    head = f"| world | bounce | robots | m/s off the floor, beside {planned:.2f} | m off its place |\n|---|---|---|---|---|\n"
+    return head + "\n".join(rows)
+
+
+def _spread(values: np.ndarray) -> str:
+    low, middle, high = np.quantile(values, [0.16, 0.5, 0.84])
+    return f"{middle:+.2f} +- {(high - low) / 2:.2f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("policy", type=Path)
+    parser.add_argument("--skill", default="dribble_in_place")
+    parser.add_argument("--robots", type=int, default=200)
+    parser.add_argument("--report", type=Path, help="Markdown to write the table to")
+    a = parser.parse_args()
+    torch.set_num_threads(1)
+    graph = graph_in(a.policy)
+    found = {}
+    for name, world in WORLDS.items():
+        found[name] = performed(a.policy, graph, a.skill, a.robots, world)
+        print(f"{name}: {np.isfinite(found[name].speed).sum(axis=0).mean():.1f} bounces a robot", flush=True)
+    clips = graph.clips
+    clip = int(np.flatnonzero(clips.skill == graph.labels.index(a.skill))[0])
+    rows = slice(clips.first[clip], clips.first[clip] + clips.length[clip])
+    planned = float(clips.qvel[rows, FLIGHT][:, 2].max())
+    text = f"`{a.skill}` of `{a.policy}`, {a.robots} robots, {SECONDS:g} s:\n\n{table(found, planned)}\n"
+    tell(text, a.report, HEAD, NOTE)
+
+
+if __name__ == "__main__":
+    main()
