@@ -70,7 +70,7 @@ def bounces(lifted: np.ndarray, rising: np.ndarray, off: np.ndarray, up: np.ndar
     return found
 
 
-def performed(path: Path, graph: PolicyGraph, skill: str, robots: int, world: World) -> Bounces:
+def watched(path: Path, graph: PolicyGraph, skill: str, robots: int, world: World) -> Bounces:
     """What ``robots`` do with a policy file in ``world``, for ``SECONDS``."""
     env = episodes_of(graph, skill, robots, SECONDS)
     env.random.fixed = {name: np.full(robots, value) for name, value in world.fixed.items()}
@@ -121,7 +121,7 @@ def main() -> None:
     graph = graph_in(a.policy)
     found = {}
     for name, world in WORLDS.items():
-        found[name] = performed(a.policy, graph, a.skill, a.robots, world)
+        found[name] = watched(a.policy, graph, a.skill, a.robots, world)
         print(f"{name}: {np.isfinite(found[name].speed).sum(axis=0).mean():.1f} bounces a robot", flush=True)
     clips = graph.clips
     clip = int(np.flatnonzero(clips.skill == graph.labels.index(a.skill))[0])
