@@ -270,6 +270,9 @@ class SerialBus:
             self._answers += answers
             self.counters.received += answers
             self.counters.rejected = self._codec.rejected
+            n = len(self.spec.motors)  # all heard: the line is the host's again
+            if self._open and self._answers >= n and np.count_nonzero(self._state.time > self._asked) == n:
+                self._open, self._order, self._fast_failures = False, self._everyone, 0
         return self._state
 
     def error_name(self, code: int) -> str:
@@ -292,14 +295,15 @@ class SerialBus:
     @property
     def waiting(self) -> float:
         """s for which answers to the last request may still come; 0: it is the host's turn."""
-        if self._clock is None or not self._open or self._whole_answer():
+        if not self._open:
             return 0.0
+        assert self._clock is not None
         return max(0.0, self._due - self._clock.now())
 
     # -- turns -------------------------------------------------------------------------------------------------------
 
     def _my_turn(self) -> bool:
-        """Whether the line is the host's: the answers to the last request came, or their time is over."""
+        """Whether the line is the host's: the answers to the last request came (``read``), or their time is over."""
         if self._clock is None:
             raise BusError(f"bus {self.spec.name}: not connected; call connect(clock) first")
         if not self._open:
@@ -308,19 +312,15 @@ class SerialBus:
             self.counters.lost += 1
             self.counters.extra["line_busy"] += 1
             return False
-        whole = self._whole_answer()
         self._open = False
-        if not whole:
-            self.counters.received += self._codec.finish(self._state, self._heard)
-            self.counters.rejected = self._codec.rejected
-        if whole:
-            self._order = self._everyone
-        else:  # the first silent one may be the reason why those behind it are
-            answered = self._state.time > self._asked
-            silent = self._order[~answered[self._order]]
-            self._order = np.concatenate([self._order[answered[self._order]], silent[1:], silent[:1]])
+        self.counters.received += self._codec.finish(self._state, self._heard)
+        self.counters.rejected = self._codec.rejected
+        answered = self._state.time > self._asked
+        silent = self._order[~answered[self._order]]
+        # The first silent one may be the reason why those behind it are.
+        self._order = np.concatenate([self._order[answered[self._order]], silent[1:], silent[:1]])
         if self._fast:
-            self._fast_failures = 0 if whole else self._fast_failures + 1
+            self._fast_failures += 1
             if self._fast_failures >= FAST_FAILURES:
                 self._fast = False
                 self.counters.extra["fast_fallbacks"] += 1
@@ -336,11 +336,6 @@ class SerialBus:
         self._due = self._asked + size * self._byte + REPLY_MARGIN
         self._open = True
         self._answers = 0
-
-    def _whole_answer(self) -> bool:
-        """Whether everybody answered the last request."""
-        n = len(self.spec.motors)
-        return self._answers >= n and bool((self._state.time > self._asked).all())
 
     def _transmit(self, data: bytes, required: bool = False) -> None:
         """Send one tick. ``required``: a full queue is an error at once, and not only after QUEUE_FULL_TIME."""
