@@ -270,12 +270,13 @@ class DynamixelCodec:
         self._goal_packet = np.frombuffer(prefix + bytes(n * GOAL_ITEM.itemsize), np.uint8).copy()
         self._goals = self._goal_packet[len(prefix) :].view(GOAL_ITEM)
         self._goals["id"] = self.ids
-        self._everyone = np.arange(n)
+        self._everyone = list(range(n))
         self._given = np.zeros((5, n))
         self._kp = b""  # that the gains in the packet are for
-        self._requests: dict[tuple[bytes, bool], bytes] = {}
-        self._fast_rows = np.zeros(0, np.intp)  # of the last fast request, in its order
-        self._asked = self._fast_rows  # rows of the last plain one
+        self._request = b""  # the last one
+        self._requested = b"", False  # the rows that it asks, as bytes; whether fast
+        self._fast_rows = np.zeros(0, np.intp)  # these rows, in their order, if it is fast
+        self._asked = self._fast_rows  # if it is plain
         self._answered = 0  # of these
         self._in_order = False  # they are 0, 1, 2, ...
         heads = [HEADER + bytes([id, STATE_SIZE + 4, 0, Instruction.STATUS]) for id in self.ids.tolist()]
@@ -294,35 +295,33 @@ class DynamixelCodec:
         raises ValueError for a value not finite."""
         c, given = command, self._given
         given[0], given[1], given[2], given[3], given[4] = c.position, c.velocity, c.kp, c.kd, c.torque
-        if not np.isfinite(given).all():
+        if np.count_nonzero(np.isfinite(given)) < given.size:
             raise ValueError(
                 f"bus {self._spec.name}: got a command that is not finite, expected numbers; nothing was sent"
             )
         position = c.position
-        if c.velocity.any() or c.torque.any():
+        if np.count_nonzero(c.velocity) or np.count_nonzero(c.torque):
             with np.errstate(over="ignore"):
                 shift = np.divide(c.kd * c.velocity + c.torque, c.kp, out=np.zeros(len(self.ids)), where=c.kp > 0)
                 position = position + shift
         if (kp := c.kp.tobytes()) != self._kp:
             self._kp = kp
             self._goals["p_gain"] = np.clip(np.rint(c.kp * self._gain), 0, GAIN_MAX)
-        ticks = position * (1.0 / TICK)
-        ticks += ZERO
-        np.minimum(np.rint(ticks, out=ticks), self._high, out=ticks)
-        self._goals["position"] = np.maximum(ticks, self._low, out=ticks)
+        ticks = np.rint(position * (1.0 / TICK) + ZERO)
+        self._goals["position"] = np.maximum(np.minimum(ticks, self._high), self._low)
         return self._sealed(self._goal_packet)
 
     def pack_request(self, rows: np.ndarray, fast: bool = False) -> bytes:
         """Ask the servos ``rows`` for their state, in this order."""
-        self._fast_rows, self._asked = (rows, rows[:0]) if fast else (rows[:0], rows)
-        self._heads, self._head_crcs = self._all_heads[self._asked], self._all_head_crcs[self._asked]
-        self._answered, self._in_order = 0, rows is self._everyone or np.array_equal(rows, self._everyone)
-        key = rows.tobytes(), fast
-        if key not in self._requests:
-            if len(self._requests) > 100:
-                self._requests.clear()
-            self._requests[key] = pack_sync_read(self.ids[rows].tobytes(), STATE_AT, STATE_SIZE, fast)
-        return self._requests[key]
+        self._answered = 0
+        if (requested := (rows.tobytes(), fast)) != self._requested:
+            self._requested = requested
+            self._request = pack_sync_read(self.ids[rows].tobytes(), STATE_AT, STATE_SIZE, fast)
+            asked = rows.copy()  # the caller may change its own
+            self._fast_rows, self._asked = (asked, asked[:0]) if fast else (asked[:0], asked)
+            self._heads, self._head_crcs = self._all_heads[self._asked], self._all_head_crcs[self._asked]
+            self._in_order = rows.tolist() == self._everyone
+        return self._request
 
     def reply_size(self, n: int, fast: bool = False) -> int:
         """Bytes that ``n`` servos answer to that, without stuffing."""

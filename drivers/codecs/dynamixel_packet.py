@@ -68,7 +68,7 @@ def places(length: int) -> np.ndarray:
 def crc16(data: bytes | np.ndarray) -> int:
     """CRC-16 of ``data``, at most LENGTH_MAX + 8 bytes."""
     values = np.frombuffer(data, np.uint8)
-    return int(np.bitwise_xor.reduce(crc_table().take(values + places(len(values))), initial=0))
+    return int(np.bitwise_xor.reduce(crc_table()[values + places(len(values))]))
 
 
 def stuff(body: bytes) -> bytes:
