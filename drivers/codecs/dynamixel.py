@@ -192,10 +192,17 @@ GOAL_ITEM = np.dtype([("id", "u1"), ("p_gain", "<u2"), ("position", "<i4")])
 STATE_FIELDS = [("torque_enable", "u1"), ("error", "u1"), ("watchdog", "u1"), ("current", "<i2"), ("velocity", "<i4"),
                 ("position", "<i4"), ("temperature", "u1")]  # fmt: skip
 STATE_ITEM = np.dtype(STATE_FIELDS)
-STATUS = np.dtype([("head", "<u8"), ("alert", "u1"), ("state", STATE_ITEM), ("crc", "<u2")])
+TAIL_SIZE = STATE_SIZE + 3  # bytes of a status packet from its error byte on: that, the state, the CRC
+STATUS = np.dtype(
+    {
+        "names": ["head", "tail", "state"],  # the state is in the tail
+        "formats": ["<u8", ("u1", (TAIL_SIZE,)), STATE_ITEM],
+        "offsets": [0, 8, 9],
+        "itemsize": 8 + TAIL_SIZE,
+    }
+)
 FAST_ITEM = np.dtype([("alert", "u1"), ("id", "u1"), ("state", STATE_ITEM), ("crc", "<u2")])
-HEAD_SIZE = 8  # bytes before the error byte
-_TAIL_PLACES = (np.arange(STATE_SIZE + 3) * 256)[:, None]
+_TAIL_PLACES = (np.arange(TAIL_SIZE) * 256)[:, None]
 BAUD_RATES = {0: 9600, 1: 57600, 2: 115200, 3: 1_000_000, 4: 2_000_000, 5: 3_000_000, 6: 4_000_000, 7: 4_500_000}
 FIRMWARE_MIN = 38  # the first with a bus watchdog
 
@@ -261,7 +268,9 @@ class DynamixelCodec:
         self._row_of = np.full(256, -1, np.intp)
         self._row_of[self.ids] = np.arange(n)
         self._gain = np.array([gain_scale(m) for m in self.models])
-        self._torque = np.array([torque_scale(m) for m in self.models])
+        # Of position, velocity and current, (3, n): what is read at 0 rad, rad/s and N m, and what a unit is.
+        self._zeros = np.array([[float(ZERO)] * n, [0.0] * n, [0.0] * n])
+        self._units = np.array([[TICK] * n, [VELOCITY_UNIT] * n, [torque_scale(m) for m in self.models]])
         self._low, self._high = np.zeros(n), np.full(n, TICKS - 1.0)
         self._parser = Parser()
         head = np.array([GOAL_AT, GOAL_SIZE], "<u2").tobytes()
@@ -397,10 +406,10 @@ class DynamixelCodec:
         n = len(status)
         at = slice(self._answered, self._answered + n)
         rows = self._asked[at]
-        if len(rows) < n or (status["head"] != self._heads[at]).any():
+        if len(rows) < n or status["head"].tobytes() != self._heads[at].tobytes():
             return False
-        tail = np.frombuffer(data, np.uint8).reshape(n, -1)[:, HEAD_SIZE:]
-        if (np.bitwise_xor.reduce(_tail_table().take(tail.T + _TAIL_PLACES), axis=0) != self._head_crcs[at]).any():
+        crcs = np.bitwise_xor.reduce(_tail_table()[status["tail"].T + _TAIL_PLACES], axis=0)
+        if crcs.tobytes() != self._head_crcs[at].tobytes():
             return False
         self._answered += n
         self._store(at if self._in_order else rows, status["state"], state, now)
@@ -422,7 +431,8 @@ class DynamixelCodec:
                 self.rejected += 1
         self.rejected += self._parser.rejected - bad
         if found:
-            self._store(np.array(found), np.frombuffer(b"".join(items), STATE_ITEM), state, now)
+            rows = slice(len(found)) if found == self._everyone else np.array(found)
+            self._store(rows, np.frombuffer(b"".join(items), STATE_ITEM), state, now)
         return len(found)
 
     def _split_fast(self, parameters: bytes) -> tuple[list[int], list[bytes]]:
@@ -454,15 +464,17 @@ class DynamixelCodec:
         return rows, blocks
 
     def _store(self, rows: np.ndarray | slice, item: np.ndarray, state: MotorState, now: float) -> None:
-        state.position[rows] = (item["position"] - float(ZERO)) * TICK
-        state.velocity[rows] = item["velocity"] * VELOCITY_UNIT
-        state.torque[rows] = item["current"] * self._torque[rows]
+        readings = np.empty((3, len(item)))
+        readings[0], readings[1], readings[2] = item["position"], item["velocity"], item["current"]
+        readings -= self._zeros[:, rows]
+        readings *= self._units[:, rows]
+        state.position[rows], state.velocity[rows], state.torque[rows] = readings[0], readings[1], readings[2]
         state.temperature[rows] = item["temperature"]
         state.error[rows] = item["error"]
         state.enabled[rows] = item["torque_enable"] == 1
         state.time[rows] = now
-        tripped = item["watchdog"] == WATCHDOG_TRIPPED
-        if tripped.any():
+        if WATCHDOG_TRIPPED in item["watchdog"].tobytes():
+            tripped = item["watchdog"] == WATCHDOG_TRIPPED
             state.error[rows] += TRIPPED * tripped
             state.enabled[rows] &= ~tripped
 
