@@ -25,6 +25,7 @@ def overhead(policy: Policy) -> Row:
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.enable_mem_reuse = False  # as sim2real/policy.py has it
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     session = onnxruntime.InferenceSession(policy.path.read_bytes(), options, providers=["CPUExecutionProvider"])
     feeds = {name: np.zeros((1, *shape), np.float32) for name, shape in policy.contract.inputs.items()}
