@@ -53,19 +53,13 @@ def port(*options: str) -> Iterator[str]:
             server.terminate()
 
 
-def measured(
-    cycles: list[Cycle], clock: Callable[[], float], blocks: int, rest: float = 0.0, least: int = 0
-) -> list[float]:
-    """Least seconds of each cycle, in interleaved blocks of ten: others on this machine only ever make it slower. Where
-    fewer than ``least`` servos were heard, it was cheap for another reason, and does not count."""
-    times = np.full((len(cycles), blocks, 10), np.inf)
+def measured(cycles: list[Cycle], clock: Callable[[], float], blocks: int, rest=0.0, least=0) -> list[float]:
+    """Least seconds of each cycle that heard ``least`` servos, in interleaved blocks of ten: others only make it slower."""
+    times = np.zeros((len(cycles), blocks, 10))
     for block, k, i in np.ndindex(blocks, len(cycles), 10):
         sleep(rest)  # s, for answers that a busy machine brings late: the next cycle would take them for its own
-        start = clock()
-        heard = cycles[k]()
-        spent = clock() - start
-        if heard >= least:
-            times[k, block, i] = spent
+        start, heard = clock(), cycles[k]()
+        times[k, block, i] = clock() - start if heard >= least else np.inf  # who did not wait for all was cheap
     return times.min(axis=(1, 2)).tolist()
 
 
