@@ -12,6 +12,7 @@ from sim2real.types import JointCommand, Mode, RobotState
 
 DT = 1 / 256  # s: a binary fraction, so that the times of ticks are exact
 G = 9.80665
+MANY = 10_000  # ticks: no test needs as many
 FIELDS = ("joint_pos", "joint_vel", "joint_torque", "kp", "kd")
 
 
@@ -28,6 +29,7 @@ class Bench:
         self.time = start
         self.pose = robot.home_pos.copy()
         self.command_time: float | None = None  # None: fresh at every tick
+        self.ticks = 0
 
     def state(self, **changes) -> RobotState:
         n = self.n
@@ -57,6 +59,8 @@ class Bench:
 
     def tick(self, dt: float = DT, command: Mapping | None = None, **changes) -> JointCommand:
         """Advance the clock and step the gate."""
+        self.ticks += 1
+        assert self.ticks < MANY, "a gate that was to answer never did"
         self.time += dt
         return self.safety.step(self.state(**changes), self.command(**command or {}), self.time)
 
