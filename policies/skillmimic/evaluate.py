@@ -186,14 +186,9 @@ def performed(
     act: Callable[[Env], Tensor] | None = None,
     fixed: Mapping[str, np.ndarray] | None = None,
 ) -> Episodes:
-    """As ``evaluate``, of one skill. ``fixed``: of terms of the randomisation what they are in each episode (episodes,);
-    NaN: drawn, as ever."""
-    env = episodes_of(graph, skill, episodes, seconds, push, seed)
+    """As ``evaluate``, of one skill; ``fixed``: see ``episodes_of``."""
+    env = episodes_of(graph, skill, episodes, seconds, push, seed, fixed)
     config = env.config
-    if fixed:
-        env.random.fixed = dict(fixed)
-        env.reset()
-        env.episode_length_buf[:] = 0
     act = act or (lambda e: graph.actor(e.observation))
     running, up = np.full(episodes, True), np.full(episodes, True)
     sums, frames, clips = np.zeros((episodes, len(Measures._fields))), np.zeros(episodes, int), env.clip.copy()
@@ -215,9 +210,17 @@ def performed(
     return Episodes(np.array(shares), sums, frames)
 
 
-def episodes_of(graph: PolicyGraph, skill: str, episodes: int, seconds: float, push: float = 0.0, seed: int = 0) -> Env:
+def episodes_of(
+    graph: PolicyGraph,
+    skill: str,
+    episodes: int,
+    seconds: float,
+    push: float = 0.0,
+    seed: int = 0,
+    fixed: Mapping[str, np.ndarray] | None = None,
+) -> Env:
     """An environment in which every robot begins an episode of ``skill``: at the beginning of a clip, where its rule needs
-    that."""
+    that. ``fixed``: of terms of the randomisation what they are in each episode (episodes,); NaN: drawn, as ever."""
     config = dataclasses.replace(
         graph.config,
         envs=episodes,
@@ -228,6 +231,9 @@ def episodes_of(graph: PolicyGraph, skill: str, episodes: int, seconds: float, p
         disturbed=0.0,
     )
     env = Env(config, UNSEEN + seed, graph, skill)
+    if fixed:
+        env.random.fixed = dict(fixed)
+        env.reset()
     env.episode_length_buf[:] = 0
     return env
 

@@ -6,6 +6,7 @@ In the training environment, as the card measures it, and then with one cause af
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +22,7 @@ from policies.skillmimic.evaluate import episodes_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.plan import GRAVITY
 from policies.skillmimic.randomisation import TABLE
+from policies.skillmimic.starts import first_clips
 
 SHOWN = 5  # bounces
 LOW = 0.3  # m: a ball that turns below bounces
@@ -28,23 +30,23 @@ AFTER = 2  # ticks from there until nothing touches it
 HEAD = "Where the one-handed dribble loses its ball"
 NOTE = """Written by `python -m policies.skillmimic.strokes`; do not edit. Of the robots of the card's training environment, from the
 first stroke on: how many see the ball bounce so often, how fast it then leaves the floor beside what the plan asks, and how
-far it is from its place beside the robot (medians, and half of what 68 % lie within). Nobody touches a ball whose speed falls
-by its restitution, 0.72 to 0.84, from one bounce to the next."""
+far it is from its place beside the robot (medians, and half of what 68 % lie within). A ball that comes up with only its
+restitution, 0.72 to 0.84, times the speed of the bounce before was not pushed."""
 
 
-class World(NamedTuple):
+class Case(NamedTuple):
     """What is otherwise than in the card."""
 
     still: bool = False  # the base does not move, whatever the arms do
     fixed: Mapping[str, float] = {}  # terms of the randomisation that are alike for all
 
 
-WORLDS = {
-    "as in the card": World(),
-    "base held still": World(still=True),
-    "motors of four times the torque": World(fixed={"strength": 4.0}),
-    "liveliest ball": World(fixed={"ball_restitution": TABLE["ball_restitution"].high}),
-    "nothing random": World(fixed={n: 0.0 if "noise" in n else (t.low + t.high) / 2 for n, t in TABLE.items()}),
+CASES = {
+    "as in the card": Case(),
+    "base held still": Case(still=True),
+    "motors of four times the torque": Case(fixed={"strength": 4.0}),
+    "liveliest ball": Case(fixed={"ball_restitution": TABLE["ball_restitution"].high}),
+    "nothing random": Case(fixed={n: 0.0 if "noise" in n else (t.low + t.high) / 2 for n, t in TABLE.items()}),
 }
 
 
@@ -70,18 +72,16 @@ def bounces(lifted: np.ndarray, rising: np.ndarray, off: np.ndarray, up: np.ndar
     return found
 
 
-def watched(path: Path, graph: PolicyGraph, skill: str, robots: int, world: World) -> Bounces:
-    """What ``robots`` do with a policy file in ``world``, for ``SECONDS``."""
-    env = episodes_of(graph, skill, robots, SECONDS)
-    env.random.fixed = {name: np.full(robots, value) for name, value in world.fixed.items()}
-    env.reset()
-    env.episode_length_buf[:] = 0
+def watched(path: Path, graph: PolicyGraph, skill: str, robots: int, case: Case) -> Bounces:
+    """What ``robots`` do with a policy file in ``case``, for ``SECONDS``."""
+    fixed = {name: np.full(robots, value) for name, value in case.fixed.items()}
+    env = episodes_of(graph, skill, robots, SECONDS, fixed=fixed)
     qpos, qvel = env.batch.bind("qpos"), env.batch.bind("qvel")
     act, up, place = BallActor(path, robots), np.full(robots, True), qpos[:, BASE].copy()
     rows = []
     with torch.no_grad():
         while up.any() and len(rows) < env.max_episode_length:
-            if world.still:
+            if case.still:
                 qpos[:, BASE], qvel[:, :6] = place, 0.0
             env.step(act(env))
             up = up & ~env.failures
@@ -92,16 +92,16 @@ def watched(path: Path, graph: PolicyGraph, skill: str, robots: int, world: Worl
 
 
 def table(found: Mapping[str, Bounces], planned: float) -> str:
-    """Markdown, a row a world and bounce; ``planned`` m/s: how fast the plan has the ball leave the floor."""
+    """Markdown, a row a case and bounce; ``planned`` m/s: how fast the plan has the ball leave the floor."""
     rows = []
-    for world, b in found.items():
+    for case, b in found.items():
         for k, (speed, off) in enumerate(zip(b.speed, b.off, strict=True)):
             there = ~np.isnan(speed)
             if there.any():
                 rows.append(
-                    f"| {world} | {k + 1} | {there.mean():.0%} | {_spread(speed[there] - planned)} | {_spread(off[there])} |"
+                    f"| {case} | {k + 1} | {there.mean():.0%} | {_spread(speed[there] - planned)} | {_spread(off[there])} |"
                 )
-    head = f"| world | bounce | robots | m/s off the floor, beside {planned:.2f} | m off its place |\n|---|---|---|---|---|\n"
+    head = f"| case | bounce | robots | m/s off the floor, beside {planned:.2f} | m off its place |\n|---|---|---|---|---|\n"
     return head + "\n".join(rows)
 
 
@@ -119,12 +119,13 @@ def main() -> None:
     a = parser.parse_args()
     torch.set_num_threads(1)
     graph = graph_in(a.policy)
+    if a.skill not in graph.labels:
+        sys.exit(f"skill: got '{a.skill}', expected one of {', '.join(graph.labels)}")
     found = {}
-    for name, world in WORLDS.items():
-        found[name] = watched(a.policy, graph, a.skill, a.robots, world)
+    for name, case in CASES.items():
+        found[name] = watched(a.policy, graph, a.skill, a.robots, case)
         print(f"{name}: {np.isfinite(found[name].speed).sum(axis=0).mean():.1f} bounces a robot", flush=True)
-    clips = graph.clips
-    clip = int(np.flatnonzero(clips.skill == graph.labels.index(a.skill))[0])
+    clips, clip = graph.clips, first_clips(graph)[graph.labels.index(a.skill)]
     rows = slice(clips.first[clip], clips.first[clip] + clips.length[clip])
     planned = float(clips.qvel[rows, FLIGHT][:, 2].max())
     text = f"`{a.skill}` of `{a.policy}`, {a.robots} robots, {SECONDS:g} s:\n\n{table(found, planned)}\n"

@@ -57,10 +57,17 @@ def test_a_row_says_how_many_got_there_and_how():
     assert "| here | 3 |" not in text
 
 
+def test_a_skill_that_the_policy_has_not_is_named(monkeypatch):
+    words = ["strokes", str(ROOT / "policies/g1/pickup.onnx"), "--skill", "juggle"]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit, match="skill: got 'juggle', expected one of pickup"):
+        strokes.main()
+
+
 @pytest.mark.slow
 def test_the_shipped_dribble_is_told_bounce_by_bounce(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(strokes, "SECONDS", 0.6)
-    monkeypatch.setattr(strokes, "WORLDS", {n: strokes.WORLDS[n] for n in ("base held still", "nothing random")})
+    monkeypatch.setattr(strokes, "CASES", {n: strokes.CASES[n] for n in ("base held still", "nothing random")})
     report = tmp_path / "dribble.md"
     words = ["strokes", str(ROOT / "policies/g1/ball.onnx"), "--robots", "2", "--report", str(report)]
     monkeypatch.setattr(sys, "argv", words)
