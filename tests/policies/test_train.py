@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -70,6 +73,21 @@ def test_a_learner_on_a_gpu_leaves_checkpoints_that_a_cpu_reads_and_goes_on_from
     assert here.resume()
     for name, value in parameters(there).items():
         torch.testing.assert_close(parameters(here)[name], value.cpu())
+
+
+def test_processes_under_torchrun_are_one_run(tmp_path):
+    run = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command = [Path(sys.executable).with_name("sim2real"), "train", "g1-basics", "--envs", "4", "--samples", "200"]
+    alone = {k: v for k, v in os.environ.items() if k not in ("RANK", "WORLD_SIZE", "LOCAL_RANK")}
+    done = subprocess.run(
+        [*run, *command, "--folder", tmp_path], env={**alone, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "config.json").read_text())["world"] == 2
+    curve = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    horizon = Basics().horizon
+    assert [row["samples"] for row in curve] == [2 * 4 * horizon * k for k in range(1, len(curve) + 1)]
+    assert curve[-1]["samples"] >= 200 and (tmp_path / "last.pt").is_file()
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
