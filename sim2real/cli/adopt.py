@@ -9,6 +9,8 @@ from typing import Annotated
 
 import tyro
 
+from sim2real.options import NewFile
+
 
 @dataclass(frozen=True)
 class Args:
@@ -20,7 +22,7 @@ class Args:
 
     source: tyro.conf.Positional[Path]  # folder, or network file, of the foreign policy
     dialect: str  # the other stack: booster_gym, holosoma, playground or unitree_rl_gym
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]  # policy file to write (.onnx)
+    output: Annotated[NewFile, tyro.conf.arg(aliases=["-o"])]  # policy file to write (.onnx)
     robot: str = "g1"  # name of a robot, or its YAML
     config: tuple[Path, ...] = ()  # configuration files of the other stack; none: those beside the network
 

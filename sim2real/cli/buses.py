@@ -15,7 +15,7 @@ from drivers.budget import LOAD_MAX, budget
 from drivers.bus import BusSpec
 from drivers.open import open_codec
 from sim2real.config import load_robot
-from sim2real.types import Sim2realError
+from sim2real.options import NotNegative
 
 
 @dataclass
@@ -26,7 +26,7 @@ class Args:
     """a robot of configs/robots, or the path of a YAML"""
     wiring: str = ""
     """which of the robot's wirings; default: its default"""
-    rate: float = 0.0
+    rate: NotNegative = 0.0
     """Hz; default: the wiring's"""
     json: bool = False
     """print JSON instead of a table"""
@@ -71,8 +71,6 @@ def main(argv: list[str]) -> int:
     config = load_robot(args.robot)
     wiring = config.wiring(args.wiring)
     rate = args.rate or wiring.rate
-    if not (rate > 0 and math.isfinite(rate)):
-        raise Sim2realError(f"--rate: got {args.rate:g} Hz, expected a positive number")
     found = rows(wiring.bus_specs(), rate)
     if args.json:
         print(json.dumps({"robot": config.name, "rate": rate, "load_max": LOAD_MAX, "buses": found}, indent=1))

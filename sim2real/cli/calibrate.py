@@ -16,6 +16,7 @@ from sim2real.bringup.calibrate import Motors, bare, checks, measure, rest
 from sim2real.calibration import Calibration, calibration_path, is_needed, load_calibration
 from sim2real.clock import MonotonicClock, SimClock
 from sim2real.config import RobotConfig, Wiring, load_robot
+from sim2real.options import MaybeNewFile, Positive, Seed
 from sim2real.robot import open_robot
 from sim2real.types import Sim2realError
 
@@ -39,13 +40,13 @@ class Args:
     """measure these anew"""
     again: bool = False
     """measure all anew"""
-    out: Path | None = None
+    out: MaybeNewFile = None
     """the calibration; default: where deploy looks for it"""
-    timeout: float = 120.0
+    timeout: Positive = 120.0
     """s for each joint"""
     sim: bool = False
     """simulated motors, put together in a way that only the seed knows, and a simulated person who moves the joints"""
-    seed: int = 0
+    seed: Seed = 0
     """with --sim: how it was put together"""
 
 

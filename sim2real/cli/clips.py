@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from sim2real.options import MaybeNewFile, MaybeNewFolder, NewFolder, NewGif, NotNegative, Positive
 from sim2real.types import Sim2realError
 
 Clips = Annotated[
@@ -29,13 +30,13 @@ class Import(Data):
     """BallPlay-M recordings (T, 337) as clips of our own format, with body positions recomputed and contact split."""
 
     clips: Clips = ()
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("clips")
+    output: Annotated[NewFolder, tyro.conf.arg(aliases=["-o"])] = Path("clips")
     """folder to write to"""
-    fps: float = 0.0
+    fps: NotNegative = 0.0
     """frames per second; default: as recorded"""
     mirror: bool = False
     """write every clip's mirror image too"""
-    report: Path | None = None
+    report: MaybeNewFile = None
     """also check them, as an .html file with pictures"""
 
 
@@ -44,7 +45,7 @@ class Describe(Data):
     """What clips hold, and whether their ball obeys physics."""
 
     clips: Clips = ()
-    report: Path | None = None
+    report: MaybeNewFile = None
     """also as an .html file with pictures"""
 
 
@@ -53,7 +54,7 @@ class View(Data):
     """A clip as a moving picture. Needs MUJOCO_GL=egl or osmesa on a machine without screen."""
 
     clips: Clips = ()
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("clip.gif")
+    output: Annotated[NewGif, tyro.conf.arg(aliases=["-o"])] = Path("clip.gif")
     """GIF to write; with several clips, their names are added"""
 
 
@@ -66,17 +67,17 @@ class Retarget(Data):
     """name of a robot, or its YAML"""
     library: bool = False
     """all pieces of the robot's library.yaml, into its folder"""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    output: Annotated[MaybeNewFolder, tyro.conf.arg(aliases=["-o"])] = None
     """folder to write to; default: clips/<robot>, or the library's"""
-    fps: float = 50.0
+    fps: Positive = 50.0
     """frames per second of the result"""
-    ball_radius: float = 0.0
+    ball_radius: NotNegative = 0.0
     """m; default: that of policies/ball.py"""
     mirror: bool = False
     """each clip's mirror image too"""
-    table: Path | None = None
+    table: MaybeNewFile = None
     """write the table of residuals to this .md or .json file"""
-    gif: Path | None = None
+    gif: MaybeNewFolder = None
     """write side-by-side GIFs, person and robot, into this folder"""
 
 

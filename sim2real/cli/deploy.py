@@ -18,6 +18,7 @@ from rich.console import Console
 
 from sim2real.config import RobotConfig, load_robot
 from sim2real.operators.script import ScriptOperator, Step, parse_script
+from sim2real.options import MaybeNewFile, MaybeNewGif, NotNegative, Seed, Velocity
 from sim2real.types import Sim2realError
 
 
@@ -38,9 +39,9 @@ class Args:
     """which of the sets of skills that the robot's YAML names; default: its default"""
     skill: str = ""
     """perform only this skill"""
-    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    velocity: Velocity = (0.0, 0.0, 0.0)
     """with --skill: forward m/s, left m/s, turn rad/s"""
-    duration: float = 0.0
+    duration: NotNegative = 0.0
     """with --skill: seconds; default 10"""
     script: str = ""
     """a timeline, as in "stand:3,squat:6,walk:5@0.5/0/0"; default: every skill in turn, but those that the robot's YAML has unshown"""
@@ -48,7 +49,7 @@ class Args:
     """who picks the skill"""
     clock: Literal["realtime", "lockstep"] = "realtime"
     """lockstep: faster than real time and deterministic, simulation only"""
-    seed: int = 0
+    seed: Seed = 0
     """of everything random in the simulation"""
     fault: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """faults of the simulated wire, as in drop:0.1 or off:left_leg/left_knee_joint@8 (s; arming is at about 3)"""
@@ -58,9 +59,9 @@ class Args:
     """where records go: a directory, or an .mcap file"""
     no_record: bool = False
     """write no record"""
-    json: Annotated[Path | None, tyro.conf.arg(name="json")] = None
+    json: Annotated[MaybeNewFile, tyro.conf.arg(name="json")] = None
     """write the summary to this file"""
-    video: Path | None = None
+    video: MaybeNewGif = None
     """with lockstep: render the run to this .gif"""
     visuals: Path | None = None
     """with --video: an MJCF to show instead, such as the maker's with its meshes (joints matched by name)"""

@@ -9,6 +9,7 @@ from pathlib import Path
 import tyro
 
 from sim2real.cli.train import training_side
+from sim2real.options import Count, MaybeNewFile, MaybeNewFolder
 
 
 @dataclass(frozen=True)
@@ -21,19 +22,19 @@ class Args:
 
     file: tyro.conf.Positional[Path] = Path("policies/g1/basics.onnx")
     """policy file"""
-    episodes: int = 100
+    episodes: Count = 100
     """per skill; a fifth of it per switch, and per cell of --tables, there 25 at most"""
-    deployed: int = 40
+    deployed: Count = 40
     """runs through the bytes, undisturbed, and as many pushed; of ball skills, per skill, with the ball known and seen"""
-    report: Path | None = None
+    report: MaybeNewFile = None
     """write every number to this JSON file"""
-    card: Path | None = None
+    card: MaybeNewFile = None
     """write the policy's card to this Markdown file"""
     tables: bool = False
     """of ball skills: other balls and every switch too (the paper's Tables 2 and 3)"""
     runs: tyro.conf.UseAppendAction[list[Path]] = field(default_factory=list)
     """of ball skills: the training runs that led to the file, in their order; what they learned when is in the card"""
-    videos: Path | None = None
+    videos: MaybeNewFolder = None
     """of ball skills: film each into this folder, as the deployed loop performs it"""
 
 

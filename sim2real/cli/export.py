@@ -9,6 +9,7 @@ from typing import Annotated
 
 import tyro
 
+from sim2real.options import NewFile
 from sim2real.types import Sim2realError
 
 
@@ -18,7 +19,7 @@ class Args:
     what was there. Needs `pip install 'sim2real[train]'`."""
 
     checkpoint: tyro.conf.Positional[Path]  # folder of the run (its best.pt), or one of its .pt files
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]  # policy file to write (.onnx)
+    output: Annotated[NewFile, tyro.conf.arg(aliases=["-o"])]  # policy file to write (.onnx)
 
 
 def main(argv: list[str]) -> int:

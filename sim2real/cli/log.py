@@ -13,8 +13,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from sim2real.options import Count, MaybeNewFile, NewFile, NotNegative
+
 Record = tyro.conf.Positional[Path]
-Output = Annotated[Path | None, tyro.conf.arg(aliases=["-o"])]
+Output = Annotated[MaybeNewFile, tyro.conf.arg(aliases=["-o"])]
 
 
 @dataclass
@@ -65,11 +67,11 @@ class ReplayArgs:
     """policy files to run instead of the recorded ones, in their order"""
     robot: str = ""
     """robot to judge by instead of the recorded file: a name, or a YAML"""
-    tolerance: float = 1e-6
+    tolerance: NotNegative = 1e-6
     """largest difference of a motor command that counts as equal, in SI units"""
-    policy_tolerance: float = 1e-4
+    policy_tolerance: NotNegative = 1e-4
     """largest difference of a joint target (rad) or skill value that counts as equal"""
-    show: int = 20
+    show: Count = 20
     """how many changes to print"""
 
     def run(self) -> int:
@@ -125,7 +127,7 @@ class ExportArgs:
 
     record: Record
     """the .mcap of a run"""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    output: Annotated[NewFile, tyro.conf.arg(aliases=["-o"])]
     """file to write; its ending decides the format"""
 
     def run(self) -> int:

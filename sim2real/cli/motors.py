@@ -14,6 +14,7 @@ from rich.table import Table
 from sim2real.bringup.observe import Observer, observers, rows
 from sim2real.clock import MonotonicClock, SimClock
 from sim2real.config import RobotConfig, Wiring, load_robot
+from sim2real.options import NotNegative
 
 ASK_PERIOD = 0.02  # s between two questions to every motor
 SHOW_PERIOD = 0.1  # s between two tables
@@ -31,7 +32,7 @@ class Args:
     """which of the robot's wirings; default: its default"""
     sim: bool = False
     """simulated motors, of a robot that hangs limp from its gantry"""
-    duration: float = 0.0
+    duration: NotNegative = 0.0
     """s; default: until Ctrl-C"""
     fault: tuple[str, ...] = ()
     """with --sim: faults of the simulated wire, as in off:left_leg/left_knee_joint"""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from sim2real.config import load_robot
+from sim2real.options import NewFile
 from sim2real.types import Sim2realError
 
 
@@ -22,7 +22,7 @@ class Args:
 
     robot: str
     """a robot of configs/robots, or the path of a YAML"""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    output: Annotated[NewFile, tyro.conf.arg(aliases=["-o"])]
     """policy file to write (.onnx)"""
 
 

@@ -21,6 +21,7 @@ from sim2real.bringup.sweeps import SWEEPS, sweep
 from sim2real.calibration import FOLDER
 from sim2real.clock import MonotonicClock, SimClock
 from sim2real.config import did_you_mean, load_robot
+from sim2real.options import Count, MaybeNewFile
 from sim2real.types import Sim2realError
 
 
@@ -42,13 +43,13 @@ class Args:
     """without --robot: the bus, as can0"""
     interface: str = "socketcan"
     """with --channel: socketcan, any interface of python-can, or serial"""
-    bitrate: int = 1_000_000
+    bitrate: Count = 1_000_000
     """with --channel: bit/s"""
     protocol: str = "damiao"
     """with --channel: what to ask in"""
     all_bitrates: bool = False
     """look at every bit rate that such motors have, not only at the bus's own (a socketcan interface has one)"""
-    out: Path | None = None
+    out: MaybeNewFile = None
     """what was found, as JSON, bus after bus; default: with --robot, bringup/ROBOT-WIRING.scan.json"""
     go_on: bool = False
     """keep the buses that are in that file already"""

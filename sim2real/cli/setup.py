@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import tyro
@@ -15,6 +14,7 @@ from drivers.open import open_codec
 from sim2real.bringup.setup import Bench, MotorList, list_path, load_list
 from sim2real.clock import MonotonicClock, SimClock
 from sim2real.config import load_robot
+from sim2real.options import MaybeNewFile
 from sim2real.types import Sim2realError
 
 
@@ -30,7 +30,7 @@ class Args:
     """only the motors of these, also if they were set up before"""
     again: bool = False
     """all anew"""
-    out: Path | None = None
+    out: MaybeNewFile = None
     """the list of motors; default: bringup/ROBOT-WIRING.motors.yaml"""
     sim: bool = False
     """a bag of simulated motors as from the factory, and a simulated person who connects them"""

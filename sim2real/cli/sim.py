@@ -16,6 +16,7 @@ from rich.markup import escape
 from drivers.bus import BusSpec
 from drivers.open import PROTOCOLS
 from sim2real.config import load_robot
+from sim2real.options import NotNegative, Seed
 from sim2real.simulation import SETTLE
 
 # How a program that knows nothing of this one connects, by protocol and else by the kind of wire. {where}: as it is served;
@@ -47,11 +48,11 @@ class Args:
     """where its topics go: lo, or lo:1 for DDS domain 1"""
     directory: Path | None = None
     """where its terminals and sockets are; default: a folder made for it"""
-    duration: float = 0.0
+    duration: NotNegative = 0.0
     """s; default: until Ctrl-C"""
     fault: tuple[str, ...] = ()
     """what goes wrong, as in drop:left_leg:0.1 or off:arm/left_elbow@5"""
-    seed: int = 0
+    seed: Seed = 0
 
 
 def plan(buses: list[BusSpec], directory: Path, can: str, dds: str) -> dict[str, str]:

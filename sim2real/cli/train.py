@@ -9,6 +9,7 @@ from typing import Literal
 
 import tyro
 
+from sim2real.options import MaybeCount, MaybeNewFolder, MaybePositive, MaybeSeed
 from sim2real.types import Sim2realError
 
 
@@ -18,17 +19,17 @@ class Args:
 
     task: tyro.conf.Positional[str]
     """what to train: g1-basics, g1-down, g1-ball or g1-pickup"""
-    folder: Path | None = None
+    folder: MaybeNewFolder = None
     """where the run lives; default: runs/<task>"""
-    samples: float | None = None
+    samples: MaybePositive = None
     """policy ticks to learn from, over all robots; default: the task's own"""
-    envs: int | None = None
+    envs: MaybeCount = None
     """robots simulated at once"""
-    threads: int | None = None
+    threads: MaybeCount = None
     """threads of the physics"""
     device: Literal["cpu", "cuda"] | None = None
     """of the learner; the physics are the CPU's"""
-    seed: int | None = None
+    seed: MaybeSeed = None
     """of everything random"""
     start: Path | None = None
     """begin from the networks of this checkpoint (policies/g1/basics.pt, say) instead of from nothing"""

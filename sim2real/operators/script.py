@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -47,9 +48,11 @@ def parse_script(text: str) -> list[Step]:
         label, _, rest = part.strip().partition(":")
         seconds, _, velocity = rest.partition("@")
         try:
-            v = tuple(float(x) for x in velocity.split("/")) if velocity else (0.0, 0.0, 0.0)
-            steps.append(Step(label, float(seconds), (v[0], v[1], v[2])))
-        except (ValueError, IndexError):
+            duration, (forward, left, turn) = float(seconds), map(float, velocity.split("/") if velocity else (0, 0, 0))
+            if not (duration > 0 and all(map(math.isfinite, (duration, forward, left, turn)))):
+                raise ValueError("no time, or no number")
+            steps.append(Step(label, duration, (forward, left, turn)))
+        except ValueError:
             raise Sim2realError(
                 f"script: got '{part.strip()}', expected LABEL:SECONDS or LABEL:SECONDS@FORWARD/LEFT/TURN, e.g. walk:5@0.5/0/0"
             ) from None

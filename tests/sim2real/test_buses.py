@@ -53,9 +53,3 @@ def test_json(capsys):
     document = json.loads(capsys.readouterr().out)
     (bus,) = document["buses"]
     assert bus["frames"] == 2 and bus["motors"] == 29 and bus["fixes"] == [] and document["rate"] == 250
-
-
-@pytest.mark.parametrize("rate", ["-5", "nan", "inf"])
-def test_a_rate_that_is_none(rate, capsys):
-    assert main(["buses", "--robot", "g1", f"--rate={rate}"]) == 2
-    assert "expected a positive number" in capsys.readouterr().err

@@ -19,7 +19,7 @@ from sim2real.config import ConfigError, load_robot
 from sim2real.guardian import Guardian
 from sim2real.operators.script import ScriptOperator, Step
 from sim2real.policy import load_policy
-from sim2real.recorder.plot import page
+from sim2real.recorder.plot import page, write_plot
 from sim2real.recorder.process import Recorder, Sink
 from sim2real.recorder.reader import Reader
 from sim2real.recorder.replay import replay
@@ -514,8 +514,8 @@ def test_a_record_of_another_version(tmp_path, capsys):
 def test_plot_says_where(record, tmp_path, capsys):
     code, out, _ = log(capsys, "plot", record, "-o", tmp_path / "r.html")
     assert code == 0 and out.strip() == str(tmp_path / "r.html")
-    code, _, err = log(capsys, "plot", record, "-o", tmp_path / "no" / "r.html")
-    assert code == 2 and "cannot write: No such file" in err
+    with pytest.raises(Sim2realError, match="cannot write: No such file"):
+        write_plot(Run(record), tmp_path / "no" / "r.html")
 
 
 def test_export(record, run, tmp_path, capsys):
