@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from policies.evaluate import (
     switch_script,
 )
 from policies.randomisation import TABLE
-from policies.spread import spread
+from policies.spread import Tell, spread, telling, unseen
 from policies.through_bytes import deploy_episode, stayed_up
 from sim2real.contract import Contract
 from sim2real.policy import load_policy
@@ -34,7 +33,6 @@ PUSH = 0.5  # m/s
 SINGLE = (0.2, 0.3, 0.4, 0.5)  # m/s
 WALK, WALK_SECONDS = (0.5, 0.0, 0.0), 20.0  # m/s, m/s, rad/s; s
 EVERY = 2.5  # s between the skill changes of the deployed runs
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ class Evaluation:
         } | {"gap": self.gap}
 
 
-def evaluate(path: Path, config: Basics, episodes: int, deployed: int, tell: Tell = lambda text: None) -> Evaluation:
+def evaluate(path: Path, config: Basics, episodes: int, deployed: int, tell: Tell = lambda text: unseen) -> Evaluation:
     """Measure a policy file: ``episodes`` per skill and a fifth of that per switch, ``deployed`` runs through the bytes.
 
     Raises Sim2realError if the file is refused or was made with other settings.
@@ -87,29 +85,27 @@ def evaluate(path: Path, config: Basics, episodes: int, deployed: int, tell: Tel
     skills = skill_script(config, len(labels), episodes, SECONDS)
     mixed = random_script(config, len(labels), episodes, SECONDS, EVERY)
     actor = FileActor(path, max(map(len, (switches, skills, mixed))))
-    tell(f"every skill, {episodes} episodes each")
-    calm = run_episodes(config, actor, skills, seed=1)
-    tell(f"every skill, pushed up to {PUSH:g} m/s")
-    pushed = run_episodes(config, actor, skills, PUSH, seed=2)
+    over = tell(f"every skill, {episodes} episodes each")
+    calm = run_episodes(config, actor, skills, seed=1, over=over)
+    over = tell(f"every skill, pushed up to {PUSH:g} m/s")
+    pushed = run_episodes(config, actor, skills, PUSH, seed=2, over=over)
     single = {}
     for speed in SINGLE:
-        tell(f"one push of {speed:g} m/s")
+        over = tell(f"one push of {speed:g} m/s")
         once = dataclasses.replace(config, push=(3.0, 3.0), push_least=1.0)
-        single[f"{speed:g}"] = run_episodes(once, actor, mixed[:, : round(5.9 / config.period)], speed, seed=6).rate()
-    tell(f"all {len(pairs)} switches")
-    switched = run_episodes(config, actor, switches, seed=3)
-    tell("a long walk, pushed")
+        script = mixed[:, : round(5.9 / config.period)]
+        single[f"{speed:g}"] = run_episodes(once, actor, script, speed, seed=6, over=over).rate()
+    switched = run_episodes(config, actor, switches, seed=3, over=tell(f"all {len(pairs)} switches"))
+    over = tell("a long walk, pushed")
     walk = np.full((min(episodes, len(mixed)), round(WALK_SECONDS / config.period)), labels.index("walk"))
-    walked = run_episodes(config, actor, walk, PUSH, seed=7, command=WALK)
-    tell("random skills")
-    trained = run_episodes(config, actor, mixed, seed=4)
+    walked = run_episodes(config, actor, walk, PUSH, seed=7, command=WALK, over=over)
+    trained = run_episodes(config, actor, mixed, seed=4, over=tell("random skills"))
     runs = {}
     for push in (0.0, PUSH):
-        tell(f"{deployed} runs through the bytes" + (", pushed" if push else ""))
+        over = tell(f"{deployed} runs through the bytes" + (", pushed" if push else ""))
         rows = random_script(config, len(labels), deployed, SECONDS, EVERY, seed=5)
-        runs[push] = spread(
-            deploy_episode, [(path, config, steps(r, labels, config.period), push, k) for k, r in enumerate(rows)]
-        )
+        each = [(path, config, steps(r, labels, config.period), push, k) for k, r in enumerate(rows)]
+        runs[push] = spread(deploy_episode, each, over)
     summaries = [summary for row in runs.values() for summary in row]
     closest = min(summaries, key=lambda s: s.joint_margin)
     survived = {push: Rate(sum(stayed_up(s, SECONDS) for s in row), len(row)) for push, row in runs.items()}
@@ -212,7 +208,7 @@ def eval_command(
         return eval_ball_skills(file, episodes, deployed, report, card_file, **of_ball_skills)
     if given := [f"--{name}" for name, value in of_ball_skills.items() if value]:
         raise Sim2realError(f"{', '.join(given)}: belongs to ball skills, and {file} handles no ball; drop it")
-    e = evaluate(file, Basics(), episodes, deployed, tell=lambda text: console.print(f"[dim]{text} ...[/]"))
+    e = evaluate(file, Basics(), episodes, deployed, telling(console))
     table = Table(title=f"{contract.name}: survival of {SECONDS:g} s (95 % confidence)", box=None)
     for column in ("skill", "undisturbed", f"pushed to {PUSH:g} m/s", "joint error"):
         table.add_column(column)

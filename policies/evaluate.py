@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from policies.basics import Basics
 from policies.env import Env
 from policies.graph import PolicyGraph
+from policies.spread import Over, unseen
 from sim2real.policy import Policy, load_policy
 from sim2real.types import Sim2realError
 
@@ -119,6 +120,7 @@ def run_episodes(
     push: float = 0.0,
     seed: int = 0,
     command: tuple[float, float, float] | None = None,
+    over: Over = unseen,
 ) -> Episodes:
     """One episode per row of ``script`` (episodes, ticks) of label indices, under randomisation that training never saw.
 
@@ -132,7 +134,7 @@ def run_episodes(
     survived, moved, ticks = np.full(len(script), True), np.zeros((len(script), 2)), np.zeros((len(script), 1))
     errors = np.zeros((script.shape[1], len(script)))
     with torch.no_grad():
-        for t in range(script.shape[1]):
+        for t in over(range(script.shape[1]), script.shape[1]):
             env.step(actor(env))
             survived &= ~env.failures
             moved += env.tick.velocity * survived[:, None]

@@ -1,4 +1,4 @@
-"""Independent runs on every core: a deployed run is one core's work, and a card needs hundreds."""
+"""Independent runs on every core, watched: a deployed run is one core's work, and a card needs hundreds."""
 
 from __future__ import annotations
 
@@ -9,10 +9,31 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
+from rich.console import Console
+from rich.progress import track
+
 Result = TypeVar("Result")
+# Hands on things, of which there are so many, as they come; and says of what is done next, by a text, how to watch it.
+Over = Callable[[Iterable[Any], int], Iterable[Any]]
+Tell = Callable[[str], Over]
 
 
-def spread(call: Callable[..., Result], runs: Iterable[tuple[Any, ...]]) -> list[Result]:
+def unseen(things: Iterable[Any], total: int) -> Iterable[Any]:
+    """Nobody watches."""
+    return things
+
+
+def telling(console: Console) -> Tell:
+    """Prints what is done next, and shows how far that is and how long it will still take."""
+
+    def tell(text: str) -> Over:
+        console.print(f"[dim]{text} ...[/]")
+        return lambda things, total: track(things, "", total, console=console, transient=True)
+
+    return tell
+
+
+def spread(call: Callable[..., Result], runs: Iterable[tuple[Any, ...]], over: Over = unseen) -> list[Result]:
     """``call(*run)`` of every run, in their order, each in one of as many processes as there are cores.
 
     ``call`` is a function of a module. What one raises is raised here.
@@ -20,9 +41,9 @@ def spread(call: Callable[..., Result], runs: Iterable[tuple[Any, ...]]) -> list
     runs = list(runs)
     workers = min(len(os.sched_getaffinity(0)), len(runs))
     if workers <= 1:
-        return [call(*run) for run in runs]
+        return [call(*run) for run in over(runs, len(runs))]
     with ProcessPoolExecutor(workers, get_context("spawn"), _one_thread) as pool:
-        return list(pool.map(_called, itertools.repeat(call), runs))
+        return list(over(pool.map(_called, itertools.repeat(call), runs), len(runs)))
 
 
 def _called(call: Callable[..., Result], run: tuple[Any, ...]) -> Result:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.release import graph_of, network_in
 from policies.skillmimic.tables import CELLS, FIRST, NOMINAL, REST, SECOND, pairs, sweep, switched
 from policies.skillmimic.through_bytes import BEFORE, graph_in, judged
-from policies.spread import spread
+from policies.spread import Tell, spread, telling, unseen
 from sim2real.contract import Contract
 from sim2real.object.camera import CameraModel
 from sim2real.object.scene import AIMING
@@ -32,7 +32,6 @@ CELL = 25  # episodes of a cell of the tables, at most
 GAP = 0.05  # of success, the most that may be lost from training's world to the bytes with a camera
 WAYS = ("training", "truth", "camera")
 WAY_NAMES = {"training": "training environment", "truth": "bytes, ball known", "camera": "bytes, ball seen"}
-Tell = Callable[[str], None]
 
 
 class Evaluation(NamedTuple):
@@ -81,7 +80,7 @@ class BallActor(FileActor):
 
 
 def evaluate(
-    path: Path, episodes: int, deployed: int, tell: Tell = lambda text: None, tables: bool = False
+    path: Path, episodes: int, deployed: int, tell: Tell = lambda text: unseen, tables: bool = False
 ) -> Evaluation:
     """Measure a policy file: ``episodes`` per skill in training's world, ``deployed`` per skill and way through the bytes;
     with ``tables``, a fifth of ``episodes``, at most ``CELL``, per cell of the paper's Tables 2 and 3.
@@ -91,8 +90,8 @@ def evaluate(
     torch.set_num_threads(1)
     policy = load_policy(path, trial=0)
     graph = graph_of(policy.contract)
-    tell(f"training environment, {episodes} episodes a skill")
-    trained = spread(in_training, [(path, n, episodes) for n in graph.labels])
+    over = tell(f"training environment, {episodes} episodes a skill")
+    trained = spread(in_training, [(path, n, episodes) for n in graph.labels], over)
     results = {
         "training": dict(zip(graph.labels, trained, strict=True)),
         "truth": through_bytes(path, graph, deployed, None, tell),
@@ -101,11 +100,11 @@ def evaluate(
     if not tables:
         return Evaluation(policy.sha256, results)
     each = max(1, min(CELL, episodes // 5))
-    tell(f"other balls, {each} episodes a cell")
-    balls = spread(with_balls, [(path, label, each) for label in graph.labels])
-    tell(f"one skill after another, {each} episodes a pair")
+    over = tell(f"other balls, {each} episodes a cell")
+    balls = spread(with_balls, [(path, label, each) for label in graph.labels], over)
+    over = tell(f"one skill after another, {each} episodes a pair")
     switches = pairs(graph)
-    shares = spread(one_after_another, [(path, *pair, each) for pair in switches])
+    shares = spread(one_after_another, [(path, *pair, each) for pair in switches], over)
     rates = {
         f"{a} > {b}": Rate(round(float(s.sum())), len(s)) for (a, b), s in zip(switches, shares, strict=True) if len(s)
     }
@@ -128,14 +127,15 @@ def one_after_another(path: Path, first: str, second: str, each: int) -> np.ndar
 
 
 def through_bytes(
-    path: Path, graph: PolicyGraph, episodes: int, camera: CameraModel | None, tell: Tell = lambda text: None
+    path: Path, graph: PolicyGraph, episodes: int, camera: CameraModel | None, tell: Tell = lambda text: unseen
 ) -> dict[str, Result]:
     """``episodes`` of every skill in the deployed loop, its clips in turn. ``camera`` None: the ball is known."""
     results = {}
     for k, label in enumerate(graph.labels):
-        tell(f"{label}: {episodes} runs through the bytes, the ball {'seen by a camera' if camera else 'known'}")
+        over = tell(f"{label}: {episodes} runs through the bytes, the ball {'seen by a camera' if camera else 'known'}")
         clips = np.flatnonzero(graph.clips.skill == k)
-        runs = spread(judged, [(path, int(clips[i % len(clips)]), SECONDS, camera, i) for i in range(episodes)])
+        each = [(path, int(clips[i % len(clips)]), SECONDS, camera, i) for i in range(episodes)]
+        runs = spread(judged, each, over)
         good, sums, frames = (np.array(column) for column in zip(*runs, strict=True))
         results[label] = Episodes(good, sums, np.maximum(frames, 1)).result()
     return results
@@ -266,7 +266,7 @@ def eval_command(
     from rich.console import Console
 
     console = Console()
-    tell = lambda text: console.print(f"[dim]{text} ...[/]")  # noqa: E731
+    tell = telling(console)
     contract = load_policy(file).contract
     curve = read(runs) if runs else None
     pictures: dict[str, str] = {}
