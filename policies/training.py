@@ -34,6 +34,8 @@ class Training:
     where there is none.
     """
 
+    task = ""  # whose run this is, by name
+
     def __init__(self, config: Any, folder: Path) -> None:
         self.config, self.folder = config, folder
         self.rank, self.world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
@@ -124,7 +126,7 @@ class Training:
         path = self.folder / "last.pt"
         if not path.is_file():
             return False
-        state = torch.load(path, weights_only=True, map_location="cpu")
+        state = load(path, f"go on from another with --start in another --folder, or delete {path.name} to begin anew")
         self.ppo.load(state["ppo"], None, strict=True)
         self.iteration, self.samples, self.best = state["iteration"], state["samples"], state["best"]
         self.env.load_state_dict(state["env"])
@@ -138,7 +140,7 @@ class Training:
         if self.rank == 0:  # what came after the checkpoint never happened
             curve = self.folder / "curve.jsonl"
             lines = curve.read_text().splitlines(keepends=True) if curve.is_file() else []
-            curve.write_text("".join(x for x in lines if json.loads(x)["iteration"] <= self.iteration))
+            curve.write_text("".join(x for x in lines if 0 < _iteration(x) <= self.iteration))
         return True
 
     def start_from(self, checkpoint: Path) -> None:
@@ -172,6 +174,7 @@ class Training:
     def _provenance(self) -> dict:
         tools = ("mujoco", "torch", "rsl-rl-lib", "numpy")
         return {
+            "task": self.task,
             "config": dataclasses.asdict(self.config),
             "world": self.world,
             "revision": git_revision(),
@@ -225,13 +228,43 @@ def read_checkpoint(path: Path, make: Callable[[dict[str, Any]], Any]) -> tuple[
     """A checkpoint's state, and its settings as ``make`` makes them of the document. Raises Sim2realError."""
     if not path.is_file():
         raise Sim2realError(f"{path}: no such checkpoint; train first: sim2real train --help lists the tasks")
-    state = torch.load(path, weights_only=True, map_location="cpu")
+    state = load(path, "train anew, or take another checkpoint")
     return state, settings(state.get("config", {}), make, path)
+
+
+def load(path: Path, remedy: str) -> dict:
+    """What a checkpoint holds. Raises Sim2realError, with the ``remedy``, if it is none or damaged."""
+    try:
+        return torch.load(path, weights_only=True, map_location="cpu")
+    except Exception as error:  # torch has no common base for what a wrong file raises
+        reason = str(error).splitlines()[0]
+        raise Sim2realError(f"{path}: {reason}; expected a checkpoint (best.pt, last.pt): {remedy}") from None
 
 
 def read_config(folder: Path, make: Callable[[dict[str, Any]], Any]) -> Any:
     """The settings written beside a run's checkpoints. Raises Sim2realError if they are of another version."""
-    return settings(json.loads((folder / "config.json").read_text())["config"], make, folder / "config.json")
+    return settings(described(folder)["config"], make, folder / "config.json")
+
+
+def described(folder: Path) -> dict[str, Any]:
+    """What stands beside a run's checkpoints: its ``task``, empty if that is not told, and its ``config``. Raises
+    Sim2realError if it cannot be read."""
+    path = folder / "config.json"
+    try:
+        document = json.loads(path.read_text())
+        return {"task": document.get("task", ""), "config": dict(document["config"])}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise Sim2realError(
+            f"{path}: {type(error).__name__}, {error}; expected what a training wrote; train in another folder"
+        ) from None
+
+
+def _iteration(line: str) -> int:
+    """Of a line of a curve; 0 of one that was torn when the machine stopped."""
+    try:
+        return int(json.loads(line)["iteration"])
+    except ValueError:
+        return 0
 
 
 def settings(document: dict[str, Any], make: Callable[[dict[str, Any]], Any], where: Path) -> Any:

@@ -71,3 +71,36 @@ def test_eval_refuses_what_is_no_policy(capsys, tmp_path):
     (tmp_path / "no.onnx").write_bytes(b"no")
     assert main(["eval", str(tmp_path / "no.onnx")]) == 2
     assert "no.onnx" in capsys.readouterr().err
+
+
+def trained(folder, samples="1") -> int:
+    return main(["train", "g1-basics", "--folder", str(folder), "--envs", "4", "--samples", samples])
+
+
+def test_the_folder_of_another_task_is_refused(tmp_path, capsys):
+    assert trained(tmp_path) == 0
+    before = (tmp_path / "config.json").read_text()
+    assert main(["train", "g1-ball", "--folder", str(tmp_path)]) == 2
+    assert f"{tmp_path}: got task 'g1-ball', but it holds a run of 'g1-basics'; name another --folder" in (
+        capsys.readouterr().err
+    )
+    assert (tmp_path / "config.json").read_text() == before
+
+
+def test_a_run_goes_on_from_a_curve_whose_last_line_was_torn(tmp_path):
+    assert trained(tmp_path) == 0
+    with (tmp_path / "curve.jsonl").open("a") as file:
+        file.write('{"iteration": 2, "samp')
+    assert trained(tmp_path, "150") == 0
+    curve = [json.loads(line)["iteration"] for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    assert curve == [1, 2]
+
+
+@pytest.mark.parametrize("name", ["last.pt", "config.json"])
+def test_a_run_that_was_damaged_is_named_and_left_as_it_is(tmp_path, capsys, name):
+    assert trained(tmp_path) == 0
+    torn = (tmp_path / name).read_bytes()[:100]
+    (tmp_path / name).write_bytes(torn)
+    assert trained(tmp_path, "150") == 2
+    assert f"error: {tmp_path / name}: " in capsys.readouterr().err
+    assert (tmp_path / name).read_bytes() == torn
