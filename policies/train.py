@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +104,11 @@ def tasks() -> dict[str, tuple[Any, Any, Any]]:
     return {name: (c, Training, basics) for name, c in TASKS.items()} | ball
 
 
+def own_cores() -> int:
+    """How many cores there are for each of the processes that torchrun began here, or for this one."""
+    return max(1, len(os.sched_getaffinity(0)) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
+
+
 def train_command(task: str, folder: Path, start: Path | None = None, **settings: Any) -> None:
     """``sim2real train``: a progress line with the time left, and what the run came to. Raises Sim2realError."""
     from rich.console import Console
@@ -116,6 +122,7 @@ def train_command(task: str, folder: Path, start: Path | None = None, **settings
         if (held := training.described(folder)["task"]) not in ("", task):
             raise Sim2realError(f"{folder}: got task '{task}', but it holds a run of '{held}'; name another --folder")
         config = training.read_config(folder, reader)
+    settings.setdefault("threads", own_cores())
     if strangers := sorted(set(settings) - {f.name for f in dataclasses.fields(config)}):
         raise Sim2realError(f"--{strangers[0]}: task '{task}' has no such setting")
     run = kind(dataclasses.replace(config, **settings), folder)

@@ -26,7 +26,7 @@ class Args:
     envs: MaybeCount = None
     """robots simulated at once"""
     threads: MaybeCount = None
-    """threads of the physics"""
+    """threads of the physics; default: one a core"""
     device: Literal["cpu", "cuda"] | None = None
     """of the learner; the physics are the CPU's"""
     seed: MaybeSeed = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import sys
 
 import pytest
@@ -75,6 +76,17 @@ def test_eval_refuses_what_is_no_policy(capsys, tmp_path):
 
 def trained(folder, samples="1") -> int:
     return main(["train", "g1-basics", "--folder", str(folder), "--envs", "4", "--samples", samples])
+
+
+@pytest.mark.parametrize(
+    ("processes", "given", "threads"), [("1", [], 3), ("2", [], 1), ("4", [], 1), ("1", ["--threads", "2"], 2)]
+)
+def test_the_physics_have_every_core_unless_told(tmp_path, monkeypatch, processes, given, threads):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2})
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", processes)
+    command = ["train", "g1-basics", "--folder", str(tmp_path), "--envs", "4", "--samples", "1", *given]
+    assert main(command) == 0
+    assert json.loads((tmp_path / "config.json").read_text())["config"]["threads"] == threads
 
 
 def test_the_folder_of_another_task_is_refused(tmp_path, capsys):
