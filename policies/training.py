@@ -149,9 +149,8 @@ class Training:
             state = torch.load(checkpoint, weights_only=True, map_location="cpu")
             self.ppo.load(state["ppo"], None, strict=True)
         except Exception as error:  # torch has no common base for what a wrong file raises
-            reason = str(error).splitlines()[0]
             raise Sim2realError(
-                f"{checkpoint}: {reason}; expected a checkpoint of this network (best.pt, last.pt)"
+                f"{checkpoint}: {_reason(error)}; expected a checkpoint of this network (best.pt, last.pt)"
             ) from None
         for group in self.ppo.optimizer.param_groups:  # the other run's came with its optimiser
             group["lr"] = self.config.learning_rate
@@ -237,8 +236,11 @@ def load(path: Path, remedy: str) -> dict:
     try:
         return torch.load(path, weights_only=True, map_location="cpu")
     except Exception as error:  # torch has no common base for what a wrong file raises
-        reason = str(error).splitlines()[0]
-        raise Sim2realError(f"{path}: {reason}; expected a checkpoint (best.pt, last.pt): {remedy}") from None
+        raise Sim2realError(f"{path}: {_reason(error)}; expected a checkpoint (best.pt, last.pt): {remedy}") from None
+
+
+def _reason(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]
 
 
 def read_config(folder: Path, make: Callable[[dict[str, Any]], Any]) -> Any:

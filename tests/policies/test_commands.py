@@ -109,9 +109,10 @@ def test_a_run_goes_on_from_a_curve_whose_last_line_was_torn(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["last.pt", "config.json"])
-def test_a_run_that_was_damaged_is_named_and_left_as_it_is(tmp_path, capsys, name):
+@pytest.mark.parametrize("left", [0, 100])
+def test_a_run_that_was_damaged_is_named_and_left_as_it_is(tmp_path, capsys, name, left):
     assert trained(tmp_path) == 0
-    torn = (tmp_path / name).read_bytes()[:100]
+    torn = (tmp_path / name).read_bytes()[:left]
     (tmp_path / name).write_bytes(torn)
     assert trained(tmp_path, "150") == 2
     assert f"error: {tmp_path / name}: " in capsys.readouterr().err
