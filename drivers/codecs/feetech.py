@@ -328,6 +328,16 @@ class FeetechCodec:
         self.rejected += self._parser.rejected - bad
         return heard
 
+    def pack_looks(self) -> list[bytes]:
+        """The question that asks every servo for its state, whether or not it is connected; nothing is written."""
+        return [self.pack_request(np.arange(len(self.ids)))]
+
+    def unpack_look(self, data: bytes, state: MotorState, now: float) -> int:
+        """``unpack``. Returns how many answers were of nobody here, or damaged."""
+        before = self.rejected
+        self.unpack(data, state, now)
+        return self.rejected - before
+
     def unpack_register(self, register: str, data: bytes) -> list[tuple[int, int]]:
         """Answers (row, value) to ``pack_read`` of that register among ``data``."""
         size = REGISTERS[register][1]

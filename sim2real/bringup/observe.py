@@ -8,10 +8,15 @@ from typing import Any, Protocol
 import numpy as np
 
 from drivers.bus import BusSpec, MotorState
+from drivers.codecs.dynamixel_look import DynamixelLook
 from drivers.codecs.unitree_hg import STATE_TOPIC, VARIANTS, read_state
 from drivers.open import open_codec, open_wire
 from drivers.wire import ERROR
 from sim2real.types import Sim2realError
+
+ANSWER = 64  # bytes, more than a servo's answer is
+# By protocol, the codec of somebody who only looks, where that is another.
+LOOKS: dict[str, Any] = {"dynamixel": DynamixelLook}
 
 
 class Observer(Protocol):
@@ -83,9 +88,40 @@ class DdsObserver:
         return f"mode_machine {self._mode_machine} ({variant.description if variant else 'unknown'}){fits}"
 
 
+class SerialObserver:
+    """Reads the servos' registers, one question at a time: the line carries one way at once."""
+
+    RETURN_DELAY = 0.0005  # s, the longest that a servo may be set to wait before it answers
+
+    def __init__(self, spec: BusSpec, wire: Any) -> None:
+        self.spec, self.codec, self._wire = spec, LOOKS.get(spec.protocol, open_codec)(spec), wire
+        self.state = MotorState.empty(len(spec.motors))
+        self._questions = self.codec.pack_looks()
+        longest = max(map(len, self._questions)) + len(spec.motors) * ANSWER
+        self._patience = 10 * longest / spec.bitrate + len(spec.motors) * self.RETURN_DELAY  # s
+        self._asked, self._now, self._due, self._strangers = 0, 0.0, 0.0, 0
+
+    def ask(self) -> None:
+        if self._now >= self._due:
+            self._wire.write(self._questions[self._asked % len(self._questions)])
+            self._asked, self._due = self._asked + 1, self._now + self._patience
+
+    def look(self, now: float) -> None:
+        self._now = now
+        self._strangers += self.codec.unpack_look(self._wire.read(), self.state, now)
+
+    def remark(self) -> str:
+        return f"{self._strangers} packets damaged or of nobody here" * bool(self._strangers)
+
+
 # By protocol, and only those whose question is nothing else: a mini-cheetah answers commands alone, and a recoil motor
 # takes the question for a target.
-OBSERVERS: dict[str, type[CanObserver] | type[DdsObserver]] = {"damiao": CanObserver, "unitree_hg": DdsObserver}
+OBSERVERS: dict[str, type[CanObserver] | type[SerialObserver] | type[DdsObserver]] = {
+    "damiao": CanObserver,
+    "dynamixel": SerialObserver,
+    "feetech": SerialObserver,
+    "unitree_hg": DdsObserver,
+}
 
 
 def observers(specs: list[BusSpec], wires: Mapping[str, Any] | None = None) -> list[Observer]:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from drivers.bus import BusError, BusSpec, MotorCommand, MotorSpec, MotorState
 from drivers.codecs import dynamixel
 from drivers.codecs.dynamixel import DynamixelCodec
+from drivers.codecs.dynamixel_look import DynamixelLook
 from drivers.codecs.dynamixel_packet import (
     BROADCAST,
     LENGTH_MAX,
@@ -376,3 +377,30 @@ def test_watchdogs_are_never_longer_than_asked_for():
 def test_models_differ_in_number():
     assert len({m.number for m in dynamixel.MODELS.values()}) == len(dynamixel.MODELS)
     assert dynamixel.damping_of(dynamixel.MODELS["XM430-W350"]) == pytest.approx(4.1 / (46 / 60 * TURN))
+
+
+def test_who_only_looks_reads_registers_where_they_are():
+    codec, state = DynamixelLook(bus(2)), MotorState.empty(2)
+    motion, health = codec.pack_looks()
+    assert motion == pack_sync_read(bytes([1, 2]), 126, 21) and health == pack_sync_read(bytes([1, 2]), 64, 35)
+    table = bytearray(147)
+    table[64], table[70] = 1, 0x04
+    for at, value, size in ((126, -100, 2), (128, 10, 4), (132, 3072, 4), (146, 41, 1)):
+        table[at : at + size] = value.to_bytes(size, "little", signed=value < 0)
+    answers = pack_status(2, 0, bytes(table[126:147])) + pack_status(2, 0x80, bytes(table[64:99]))
+    assert codec.unpack_look(motion + answers, state, 3.0) == 0
+    assert state.position[1] == pytest.approx(TURN / 4) and state.velocity[1] == pytest.approx(0.2397, abs=1e-4)
+    assert state.torque[1] == pytest.approx(-100 * 0.00269 * 4.1 / 2.3)
+    assert (state.temperature[1], state.time[1], state.time[0]) == (41, 3.0, -np.inf)
+    assert state.enabled[1] and codec.error_name(int(state.error[1])) == "overheating"
+    table[98] = 0xFF
+    codec.unpack_look(pack_status(2, 0, bytes(table[64:99])), state, 3.1)
+    assert not state.enabled[1] and codec.error_name(int(state.error[1])) == "overheating, bus watchdog tripped"
+
+
+def test_who_only_looks_counts_strangers_and_damage():
+    codec, state = DynamixelLook(bus(2)), MotorState.empty(2)
+    stranger, torn = pack_status(9, 0, bytes(21)), bytearray(pack_status(1, 0, bytes(21)))
+    torn[12] ^= 1
+    assert codec.unpack_look(stranger + bytes(torn) + pack_status(1, 0, bytes(4)), state, 1.0) == 3
+    assert (state.time == -np.inf).all()

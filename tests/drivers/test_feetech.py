@@ -189,3 +189,13 @@ def test_a_servo_in_another_mode_is_refused():
 
     with pytest.raises(BusError, match="register MODE is 1, expected 0"):
         open_bus(BUS, ScriptedServos(3, MODE=1)).connect(Clock())
+
+
+def test_who_only_looks_asks_for_the_state_that_a_tick_reads():
+    codec, state = FeetechCodec(BUS), MotorState.empty(3)
+    assert codec.pack_looks() == [codec.pack_request(np.arange(3))]
+    torn = bytearray(answer(1))
+    torn[-1] ^= 1
+    assert codec.unpack_look(answer(2, torque=0, position=3072) + bytes(torn) + answer(9), state, 2.0) == 2
+    assert state.time.tolist() == [-np.inf, 2.0, -np.inf]
+    assert state.position[1] == pytest.approx(np.pi / 2) and not state.enabled[1]

@@ -18,6 +18,7 @@ from drivers.codecs import feetech
 from drivers.codecs.feetech import BROADCAST, Instruction, pack
 from drivers.open import open_bus, open_world
 from drivers.sim.serial_pty import bus_of
+from sim2real.bringup.observe import observers
 
 ROOT = Path(__file__).resolve().parents[2]
 MODEL = "STS3215-12V"
@@ -352,3 +353,16 @@ def test_the_sdk_packs_what_we_pack():
         pack(BROADCAST, Instruction.SYNC_WRITE, bytes([40, 1, 1, 0, 2, 1])),
     ]
     assert servos.scs_toscs(-5, 15) == feetech.to_sign_magnitude(np.array(-5))
+
+
+def test_servos_that_nobody_has_connected_to_are_seen_where_they_are():
+    b = bench(3)
+    b.body.joint_pos[:] = [-0.5, 0.0, 1.0]
+    (observer,) = observers([b.spec], {b.spec.name: b.wire})
+    for _ in range(10):
+        observer.ask()
+        b.wait(0.02)
+        observer.look(b.time)
+    state = observer.state
+    assert (b.time - state.time < 0.05).all() and not state.enabled.any() and observer.remark() == ""
+    assert state.position == pytest.approx([-0.5, 0.0, 1.0], abs=0.01)

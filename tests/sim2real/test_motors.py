@@ -9,6 +9,8 @@ import pytest
 
 from drivers.bus import BusSpec, MotorSpec
 from drivers.codecs import damiao
+from drivers.codecs.dynamixel_packet import Instruction, Parser
+from drivers.sim.serial_line import SerialLineWire
 from drivers.sim.wire import SimCanWire
 from sim2real.bringup.observe import observers
 from sim2real.cli import main
@@ -16,7 +18,7 @@ from sim2real.cli.motors import Watch, _table
 from sim2real.config import load_robot
 from sim2real.types import Sim2realError
 
-WIRINGS = [("bench", "can"), ("g1", "can"), ("g1", "dds")]
+WIRINGS = [("bench", "can"), ("g1", "can"), ("g1", "dds"), ("op3", "serial")]
 
 
 def watch(robot: str, wiring: str = "", *faults: str) -> tuple[Watch, list[dict]]:
@@ -45,6 +47,37 @@ def test_nothing_but_questions_is_sent(monkeypatch):
     watch("g1", "can", "reboot:left_leg/left_knee_joint=0.05@0.05")
     frames = np.concatenate(sent)
     assert (frames["id"] == damiao.BROADCAST_ID).all() and (frames["data"][:, 2] == damiao.Operation.REFRESH).all()
+
+
+def test_nothing_but_reads_is_sent_to_servos(monkeypatch):
+    sent, write = bytearray(), SerialLineWire.write
+    monkeypatch.setattr(SerialLineWire, "write", lambda self, data: (sent.extend(data), write(self, data)))
+    watch("op3", "serial", "off:body/r_knee")
+    packets = Parser().feed(bytes(sent))
+    assert len(packets) > 5 and {p.instruction for p in packets} == {Instruction.SYNC_READ}
+
+
+def test_a_slow_line_is_asked_again_when_answers_may_be_over():
+    motors = tuple(MotorSpec(f"joint_{i}", "XL430-W250", i) for i in range(12))
+    wire = Unanswered()
+    (observer,) = observers([BusSpec("arm", "dynamixel", motors, bitrate=57600)], {"arm": wire})
+    for tick in range(50):
+        observer.ask()
+        observer.look(tick * 0.02)
+    answers = 12 * (35 + 11) * 10 / 57600  # s, without the servos' own delays
+    assert 3 <= wire.written <= 1 / answers and observer.remark() == ""
+
+
+class Unanswered:
+    """A serial line on which nobody is."""
+
+    written = 0
+
+    def write(self, data: bytes) -> None:
+        self.written += 1
+
+    def read(self) -> bytes:
+        return b""
 
 
 def test_a_dead_motor_is_silent_and_exit_code_1(capsys):
