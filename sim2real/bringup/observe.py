@@ -89,7 +89,8 @@ class DdsObserver:
 
 
 class SerialObserver:
-    """Reads the servos' registers, one question at a time: the line carries one way at once."""
+    """Reads the servos' registers, one question at a time: the line carries one way at once. A servo's bus watchdog hears the
+    questions too; nobody else can hold the line open meanwhile, for it is opened exclusively."""
 
     RETURN_DELAY = 0.0005  # s, the longest that a servo may be set to wait before it answers
 
@@ -114,12 +115,13 @@ class SerialObserver:
         return f"{self._strangers} packets damaged or of nobody here" * bool(self._strangers)
 
 
-# By protocol, and only those whose question is nothing else: a mini-cheetah answers commands alone, and a recoil motor
-# takes the question for a target.
+# By protocol, and only those whose question is nothing else: a mini-cheetah answers commands alone, a recoil motor takes the
+# question for a target, a RobStride is written to, and an ODrive's watchdog would be fed for a host that has died.
 OBSERVERS: dict[str, type[CanObserver] | type[SerialObserver] | type[DdsObserver]] = {
     "damiao": CanObserver,
     "dynamixel": SerialObserver,
     "feetech": SerialObserver,
+    "moteus": CanObserver,
     "unitree_hg": DdsObserver,
 }
 

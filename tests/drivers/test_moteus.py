@@ -23,6 +23,7 @@ from drivers.codecs.moteus_frame import (
     subframes,
 )
 from drivers.wire import EXTENDED, make_fd_frames
+from sim2real.bringup.observe import observers
 
 GAINS = Gains(np.array([40.0, 20.0]), np.array([2.0, 1.0]), np.array([2.0, 3.0]))
 COMMAND = MotorCommand(
@@ -265,3 +266,15 @@ def test_wirings_that_cannot_be():
     ):
         with pytest.raises(BusError, match=message):
             MoteusCodec(replace(spec, motors=(motor,)))
+
+
+def test_who_only_looks_is_answered_by_motors_that_go_on_as_they_were(tmp_path):
+    bench = Bench(tmp_path, "moteus", connect=False, joint_pos={"left": 0.4, "right": -0.2})
+    (observer,) = observers([bench.spec], bench.world.wires)
+    for _ in range(10):
+        observer.ask()
+        bench.world.advance(bench.world.time + 0.02)
+        observer.look(bench.world.time)
+    state, plant = observer.state, bench.world.plant
+    assert (bench.world.time - state.time < 0.03).all() and not state.enabled.any() and observer.remark() == ""
+    assert state.position == pytest.approx(plant.joint_pos, abs=0.02) and (state.error == 0).all()
