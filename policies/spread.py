@@ -7,10 +7,10 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from rich.console import Console
-from rich.progress import track
+if TYPE_CHECKING:  # every worker imports this file, and none of them shows anything
+    from rich.console import Console
 
 Result = TypeVar("Result")
 # Hands on things, of which there are so many, as they come; and says of what is done next, by a text, how to watch it.
@@ -25,6 +25,7 @@ def unseen(things: Iterable[Any], total: int) -> Iterable[Any]:
 
 def telling(console: Console) -> Tell:
     """Prints what is done next, and shows how far that is and how long it will still take."""
+    from rich.progress import track
 
     def tell(text: str) -> Over:
         console.print(f"[dim]{text} ...[/]")

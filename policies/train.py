@@ -119,9 +119,7 @@ def train_command(task: str, folder: Path, start: Path | None = None, **settings
         raise Sim2realError(f"task: got '{task}', expected one of {', '.join(known)}")
     config, kind, reader = known[task]
     if (folder / "config.json").is_file():
-        if (held := training.described(folder)["task"]) not in ("", task):
-            raise Sim2realError(f"{folder}: got task '{task}', but it holds a run of '{held}'; name another --folder")
-        config = training.read_config(folder, reader)
+        config = training.read_config(folder, reader, task)
     settings.setdefault("threads", own_cores())
     if strangers := sorted(set(settings) - {f.name for f in dataclasses.fields(config)}):
         raise Sim2realError(f"--{strangers[0]}: task '{task}' has no such setting")

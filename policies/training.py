@@ -243,22 +243,20 @@ def _reason(error: Exception) -> str:
     return (str(error) or type(error).__name__).splitlines()[0]
 
 
-def read_config(folder: Path, make: Callable[[dict[str, Any]], Any]) -> Any:
-    """The settings written beside a run's checkpoints. Raises Sim2realError if they are of another version."""
-    return settings(described(folder)["config"], make, folder / "config.json")
-
-
-def described(folder: Path) -> dict[str, Any]:
-    """What stands beside a run's checkpoints: its ``task``, empty if that is not told, and its ``config``. Raises
-    Sim2realError if it cannot be read."""
+def read_config(folder: Path, make: Callable[[dict[str, Any]], Any], task: str = "") -> Any:
+    """The settings written beside a run's checkpoints. Raises Sim2realError if they cannot be read, are of another version, or
+    the run is of another task than ``task``, where both are told."""
     path = folder / "config.json"
     try:
         document = json.loads(path.read_text())
-        return {"task": document.get("task", ""), "config": dict(document["config"])}
+        held, config = document.get("task"), dict(document["config"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise Sim2realError(
             f"{path}: {type(error).__name__}, {error}; expected what a training wrote; train in another folder"
         ) from None
+    if held and task and held != task:
+        raise Sim2realError(f"{folder}: got task '{task}', but it holds a run of '{held}'; name another --folder")
+    return settings(config, make, path)
 
 
 def _iteration(line: str) -> int:

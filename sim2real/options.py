@@ -48,7 +48,7 @@ def _file(ending: str = "") -> Any:
         path = Path(words[0])
         if path.is_dir():
             raise ValueError(f"got {path}, a folder, expected a file to write")
-        if path.suffix.lower() != ending and ending:
+        if ending and path.suffix.lower() != ending:
             raise ValueError(f"got {path}, expected a file to write that ends in {ending}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

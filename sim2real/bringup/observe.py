@@ -11,10 +11,12 @@ from drivers.bus import BusSpec, MotorState
 from drivers.codecs.dynamixel_look import DynamixelLook
 from drivers.codecs.unitree_hg import STATE_TOPIC, VARIANTS, read_state
 from drivers.open import open_codec, open_wire
+from drivers.serial_bus import BITS_PER_BYTE
 from drivers.wire import ERROR
 from sim2real.types import Sim2realError
 
 ANSWER = 64  # bytes, more than a servo's answer is
+RETURN_DELAY = 0.0005  # s, the longest that a servo may be set to wait before it answers
 # By protocol, the codec of somebody who only looks, where that is another.
 LOOKS: dict[str, Any] = {"dynamixel": DynamixelLook}
 
@@ -92,14 +94,12 @@ class SerialObserver:
     """Reads the servos' registers, one question at a time: the line carries one way at once. A servo's bus watchdog hears the
     questions too; nobody else can hold the line open meanwhile, for it is opened exclusively."""
 
-    RETURN_DELAY = 0.0005  # s, the longest that a servo may be set to wait before it answers
-
     def __init__(self, spec: BusSpec, wire: Any) -> None:
         self.spec, self.codec, self._wire = spec, LOOKS.get(spec.protocol, open_codec)(spec), wire
         self.state = MotorState.empty(len(spec.motors))
         self._questions = self.codec.pack_looks()
         longest = max(map(len, self._questions)) + len(spec.motors) * ANSWER
-        self._patience = 10 * longest / spec.bitrate + len(spec.motors) * self.RETURN_DELAY  # s
+        self._patience = BITS_PER_BYTE * longest / spec.bitrate + len(spec.motors) * RETURN_DELAY  # s
         self._asked, self._now, self._due, self._strangers = 0, 0.0, 0.0, 0
 
     def ask(self) -> None:
