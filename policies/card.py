@@ -21,8 +21,8 @@ from policies.evaluate import (
     skill_script,
     switch_script,
 )
+from policies.parts import Parts, kept
 from policies.randomisation import TABLE
-from policies.spread import Tell, spread, telling, unseen
 from policies.through_bytes import deploy_episode, stayed_up
 from sim2real.contract import Contract
 from sim2real.policy import load_policy
@@ -74,7 +74,7 @@ class Evaluation:
         } | {"gap": self.gap}
 
 
-def evaluate(path: Path, config: Basics, episodes: int, deployed: int, tell: Tell = lambda text: unseen) -> Evaluation:
+def evaluate(path: Path, config: Basics, episodes: int, deployed: int, parts: Parts) -> Evaluation:
     """Measure a policy file: ``episodes`` per skill and a fifth of that per switch, ``deployed`` runs through the bytes.
 
     Raises Sim2realError if the file is refused or was made with other settings.
@@ -85,27 +85,24 @@ def evaluate(path: Path, config: Basics, episodes: int, deployed: int, tell: Tel
     skills = skill_script(config, len(labels), episodes, SECONDS)
     mixed = random_script(config, len(labels), episodes, SECONDS, EVERY)
     actor = FileActor(path, max(map(len, (switches, skills, mixed))))
-    over = tell(f"every skill, {episodes} episodes each")
-    calm = run_episodes(config, actor, skills, seed=1, over=over)
-    over = tell(f"every skill, pushed up to {PUSH:g} m/s")
-    pushed = run_episodes(config, actor, skills, PUSH, seed=2, over=over)
+    calm = parts.once(f"every skill, {episodes} episodes each", run_episodes, config, actor, skills, seed=1)
+    pushed = parts.once(f"every skill, pushed up to {PUSH:g} m/s", run_episodes, config, actor, skills, PUSH, seed=2)
     single = {}
     for speed in SINGLE:
-        over = tell(f"one push of {speed:g} m/s")
-        once = dataclasses.replace(config, push=(3.0, 3.0), push_least=1.0)
+        pushes = dataclasses.replace(config, push=(3.0, 3.0), push_least=1.0)
         script = mixed[:, : round(5.9 / config.period)]
-        single[f"{speed:g}"] = run_episodes(once, actor, script, speed, seed=6, over=over).rate()
-    switched = run_episodes(config, actor, switches, seed=3, over=tell(f"all {len(pairs)} switches"))
-    over = tell("a long walk, pushed")
+        found = parts.once(f"one push of {speed:g} m/s", run_episodes, pushes, actor, script, speed, seed=6)
+        single[f"{speed:g}"] = found.rate()
+    switched = parts.once(f"all {len(pairs)} switches", run_episodes, config, actor, switches, seed=3)
     walk = np.full((min(episodes, len(mixed)), round(WALK_SECONDS / config.period)), labels.index("walk"))
-    walked = run_episodes(config, actor, walk, PUSH, seed=7, command=WALK, over=over)
-    trained = run_episodes(config, actor, mixed, seed=4, over=tell("random skills"))
+    walked = parts.once("a long walk, pushed", run_episodes, config, actor, walk, PUSH, seed=7, command=WALK)
+    trained = parts.once("random skills", run_episodes, config, actor, mixed, seed=4)
     runs = {}
     for push in (0.0, PUSH):
-        over = tell(f"{deployed} runs through the bytes" + (", pushed" if push else ""))
         rows = random_script(config, len(labels), deployed, SECONDS, EVERY, seed=5)
         each = [(path, config, steps(r, labels, config.period), push, k) for k, r in enumerate(rows)]
-        runs[push] = spread(deploy_episode, each, over)
+        text = f"{deployed} runs through the bytes" + (", pushed" if push else "")
+        runs[push] = parts.each(text, deploy_episode, each)
     summaries = [summary for row in runs.values() for summary in row]
     closest = min(summaries, key=lambda s: s.joint_margin)
     survived = {push: Rate(sum(stayed_up(s, SECONDS) for s in row), len(row)) for push, row in runs.items()}
@@ -208,7 +205,8 @@ def eval_command(
         return eval_ball_skills(file, episodes, deployed, report, card_file, **of_ball_skills)
     if given := [f"--{name}" for name, value in of_ball_skills.items() if value]:
         raise Sim2realError(f"{', '.join(given)}: belongs to ball skills, and {file} handles no ball; drop it")
-    e = evaluate(file, Basics(), episodes, deployed, telling(console))
+    with kept(console, file.stem, file.read_bytes(), episodes, deployed) as parts:
+        e = evaluate(file, Basics(), episodes, deployed, parts)
     table = Table(title=f"{contract.name}: survival of {SECONDS:g} s (95 % confidence)", box=None)
     for column in ("skill", "undisturbed", f"pushed to {PUSH:g} m/s", "joint error"):
         table.add_column(column)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from policies.basics import Basics
 from policies.env import Env
 from policies.graph import PolicyGraph
-from policies.spread import Over, unseen
+from policies.parts import Array, Over, unseen
 from sim2real.policy import Policy, load_policy
 from sim2real.types import Sim2realError
 
@@ -49,12 +49,10 @@ class Rate(NamedTuple):
 class Episodes(NamedTuple):
     """What became of scripted episodes."""
 
-    survived: np.ndarray  # (episodes,) bool
-    error: np.ndarray  # (episodes,) rad, mean distance of the joints from their reference
-    life: np.ndarray  # (episodes,) ticks until it fell
-    velocity: (
-        np.ndarray
-    )  # (episodes, 2) m/s, mean of the base over the ground, forwards and to the left, while it is up
+    survived: Array  # (episodes,) bool
+    error: Array  # (episodes,) rad, mean distance of the joints from their reference
+    life: Array  # (episodes,) ticks until it fell
+    velocity: Array  # (episodes, 2) m/s, mean of the base over the ground, forwards and to the left, while it is up
 
     def rate(self, where: np.ndarray | slice = slice(None)) -> Rate:
         chosen = self.survived[where]

@@ -7,21 +7,23 @@ find out by themselves that a ball is to be pressed; so do these: the plan is th
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
+import tyro
 
 from policies.evaluate import Rate
 from policies.skillmimic.card import SECONDS
-from policies.skillmimic.config import TASKS, SkillMimic
+from policies.skillmimic.config import TASKS, SkillMimic, Task, known_skill
 from policies.skillmimic.evaluate import Result, performed
 from policies.skillmimic.rewards import SENSITIVITIES, VARIANTS
 from policies.skillmimic.train import SkillTraining, load_graph
+from sim2real.options import Count, MaybeNewFile, Positive
 
 FOLDER = Path("runs/ablation")
 # Steps of a learner that has everything to find, and is to have found some of it after 0.2 M samples.
@@ -87,15 +89,32 @@ def table(found: dict[str, list[Result]]) -> str:
     return head + "\n".join(rows)
 
 
-def arguments(what: str | None, seeds: range, default: int) -> argparse.ArgumentParser:
-    """What every comparison asks for; ``what`` begins with a sentence that says which it is."""
-    parser = argparse.ArgumentParser(description=(what or "").partition("\n")[0])
-    parser.add_argument("task", choices=[name for name, c in TASKS.items() if c.base])
-    parser.add_argument("--samples", type=float, default=0.3e6, help="of a run with one skill")
-    parser.add_argument("--seeds", type=int, choices=seeds, default=default)
-    parser.add_argument("--episodes", type=int, default=100, help="of each seed")
-    parser.add_argument("--report", type=Path, help="Markdown to write the table to")
-    return parser
+@dataclass(frozen=True)
+class Comparison:
+    """What every comparison asks for."""
+
+    task: tyro.conf.Positional[Task]
+    """whose settings"""
+    samples: Positive = 0.3e6
+    """of a run with one skill"""
+    seeds: Literal[1, 2, 3, 4, 5] = 2
+    """runs of each kind"""
+    episodes: Count = 100
+    """of each seed"""
+    report: MaybeNewFile = None
+    """write the table to this Markdown file"""
+
+
+@dataclass(frozen=True)
+class Args(Comparison):
+    """The paper's Table 1 on one skill."""
+
+    skill: tyro.conf.Positional[str] = "hold"
+    """which of the task's"""
+    variants: tuple[Literal["skillmimic", "no_cgr", "no_multiplication", "deepmimic", "amp"], ...] = tuple(VARIANTS)
+    """rewards to compare"""
+    seeds: Literal[2, 3, 4, 5] = 3
+    """runs of each reward"""
 
 
 def tell(text: str, report: Path | None, head: str, note: str) -> None:
@@ -106,12 +125,8 @@ def tell(text: str, report: Path | None, head: str, note: str) -> None:
 
 
 def main() -> None:
-    parser = arguments(__doc__, range(2, 6), 3)
-    parser.add_argument("skill")
-    parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
-    a = parser.parse_args()
-    if a.skill not in TASKS[a.task].skills:
-        sys.exit(f"skill: got '{a.skill}', expected one of {', '.join(TASKS[a.task].skills)}")
+    a = tyro.cli(Args, prog="python -m policies.skillmimic.ablation")
+    known_skill(a.task, a.skill)
     torch.set_num_threads(1)
     found: dict[str, list[Result]] = {variant: [] for variant in a.variants}
     for seed in range(1, a.seeds + 1):

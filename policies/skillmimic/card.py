@@ -12,13 +12,13 @@ import numpy as np
 import torch
 
 from policies.evaluate import FileActor, Rate
+from policies.parts import Array, Parts, kept
 from policies.skillmimic.curves import PAPER, Curve, learned, read, svg
 from policies.skillmimic.evaluate import BALL_NEAR, BODY_NEAR, Episodes, Result, performed, rule_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.release import graph_of, network_in
 from policies.skillmimic.tables import CELLS, FIRST, NOMINAL, REST, SECOND, pairs, sweep, switched
 from policies.skillmimic.through_bytes import BEFORE, graph_in, judged
-from policies.spread import Tell, spread, telling, unseen
 from sim2real.contract import Contract
 from sim2real.object.camera import CameraModel
 from sim2real.object.scene import AIMING
@@ -79,9 +79,7 @@ class BallActor(FileActor):
         self.policies[k].reset({name: carry[k].numpy() for name, carry in env.carries.items()})
 
 
-def evaluate(
-    path: Path, episodes: int, deployed: int, tell: Tell = lambda text: unseen, tables: bool = False
-) -> Evaluation:
+def evaluate(path: Path, episodes: int, deployed: int, parts: Parts, tables: bool = False) -> Evaluation:
     """Measure a policy file: ``episodes`` per skill in training's world, ``deployed`` per skill and way through the bytes;
     with ``tables``, a fifth of ``episodes``, at most ``CELL``, per cell of the paper's Tables 2 and 3.
 
@@ -90,21 +88,24 @@ def evaluate(
     torch.set_num_threads(1)
     policy = load_policy(path, trial=0)
     graph = graph_of(policy.contract)
-    over = tell(f"training environment, {episodes} episodes a skill")
-    trained = spread(in_training, [(path, n, episodes) for n in graph.labels], over)
+    trained = parts.each(
+        f"training environment, {episodes} episodes a skill", in_training, [(path, n, episodes) for n in graph.labels]
+    )
     results = {
         "training": dict(zip(graph.labels, trained, strict=True)),
-        "truth": through_bytes(path, graph, deployed, None, tell),
-        "camera": through_bytes(path, graph, deployed, CameraModel(), tell),
+        "truth": through_bytes(path, graph, deployed, None, parts),
+        "camera": through_bytes(path, graph, deployed, CameraModel(), parts),
     }
     if not tables:
         return Evaluation(policy.sha256, results)
     each = max(1, min(CELL, episodes // 5))
-    over = tell(f"other balls, {each} episodes a cell")
-    balls = spread(with_balls, [(path, label, each) for label in graph.labels], over)
-    over = tell(f"one skill after another, {each} episodes a pair")
+    balls = parts.each(f"other balls, {each} episodes a cell", with_balls, [(path, n, each) for n in graph.labels])
     switches = pairs(graph)
-    shares = spread(one_after_another, [(path, *pair, each) for pair in switches], over)
+    shares = parts.each(
+        f"one skill after another, {each} episodes a pair",
+        one_after_another,
+        [(path, *pair, each) for pair in switches],
+    )
     rates = {
         f"{a} > {b}": Rate(round(float(s.sum())), len(s)) for (a, b), s in zip(switches, shares, strict=True) if len(s)
     }
@@ -121,21 +122,21 @@ def with_balls(path: Path, label: str, each: int) -> dict[str, Rate]:
     return sweep(graph_in(path), label, each, SECONDS, BallActor(path, each * len(CELLS)))
 
 
-def one_after_another(path: Path, first: str, second: str, each: int) -> np.ndarray:
+def one_after_another(path: Path, first: str, second: str, each: int) -> Array:
     """Success of a policy file's ``second`` skill after its ``first``, of ``each`` episodes."""
     return switched(graph_in(path), first, second, each, BallActor(path, each))
 
 
 def through_bytes(
-    path: Path, graph: PolicyGraph, episodes: int, camera: CameraModel | None, tell: Tell = lambda text: unseen
+    path: Path, graph: PolicyGraph, episodes: int, camera: CameraModel | None, parts: Parts
 ) -> dict[str, Result]:
     """``episodes`` of every skill in the deployed loop, its clips in turn. ``camera`` None: the ball is known."""
     results = {}
     for k, label in enumerate(graph.labels):
-        over = tell(f"{label}: {episodes} runs through the bytes, the ball {'seen by a camera' if camera else 'known'}")
         clips = np.flatnonzero(graph.clips.skill == k)
         each = [(path, int(clips[i % len(clips)]), SECONDS, camera, i) for i in range(episodes)]
-        runs = spread(judged, each, over)
+        text = f"{label}: {episodes} runs through the bytes, the ball {'seen by a camera' if camera else 'known'}"
+        runs = parts.each(text, judged, each)
         good, sums, frames = (np.array(column) for column in zip(*runs, strict=True))
         results[label] = Episodes(good, sums, np.maximum(frames, 1)).result()
     return results
@@ -266,7 +267,6 @@ def eval_command(
     from rich.console import Console
 
     console = Console()
-    tell = telling(console)
     contract = load_policy(file).contract
     curve = read(runs) if runs else None
     pictures: dict[str, str] = {}
@@ -275,12 +275,13 @@ def eval_command(
 
         graph = graph_of(contract)
         for label in contract.skill_labels:
-            tell(f"{label}: a film")
+            console.print(f"[dim]{label}: a film ...[/]")
             gif = videos / f"{label}.gif"
             shown = film(file, graph, label, gif)
             console.print(f"{gif}: {f'run {shown}, the first good one' if shown else 'no good run among those tried'}")
             pictures[label] = _link(gif, card_file)
-    e = evaluate(file, episodes, deployed, tell, tables)
+    with kept(console, file.stem, file.read_bytes(), episodes, deployed, tables) as parts:
+        e = evaluate(file, episodes, deployed, parts, tables)
     show(console, contract, e)
     if report:
         report.write_text(json.dumps(e.as_dict(), indent=1) + "\n")

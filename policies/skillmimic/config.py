@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,7 @@ BALL = {  # a clip each: the calmest, and those that come from and go to the fro
     "bounce_walk": "bounce_walk_01",
 }
 WALKS = {"carry": None, "bounce_walk": ((0.1, -0.1, -0.3), (0.3, 0.1, 0.3))}
+Task = Literal["g1-ball", "g1-pickup"]  # the keys of TASKS
 # Small steps from a plan that works; each task then looks every few iterations at what is best.
 GENTLE = SkillMimic(corrections=PLAN, push_chance=0.004, learning_rate=3e-4, std=0.1)
 TASKS: dict[str, SkillMimic] = {
@@ -105,3 +108,9 @@ TASKS: dict[str, SkillMimic] = {
     "g1-pickup": replace(GENTLE, base=DOWN, skills=("pickup",), clips=("pickup_09",), frames=400,
                          samples=0.4e6, save_every=8, evaluate_every=8, evaluate_envs=64),
 }  # fmt: skip
+
+
+def known_skill(task: str, skill: str) -> None:
+    """Ends the program, with a word of what is known, for a ``skill`` that ``task`` has not."""
+    if skill not in TASKS[task].skills:
+        sys.exit(f"skill: got '{skill}', expected one of {', '.join(TASKS[task].skills)}")

@@ -11,8 +11,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
+import tyro
 
-from policies.skillmimic.ablation import arguments, bare, pooled, tell, train
+from policies.skillmimic.ablation import Comparison, bare, pooled, tell, train
 from policies.skillmimic.card import SECONDS
 from policies.skillmimic.config import TASKS
 from policies.skillmimic.env import Env
@@ -43,7 +44,11 @@ def table(found: Found) -> str:
 
 
 def main() -> None:
-    a = arguments(__doc__, range(1, 6), 2).parse_args()
+    a = tyro.cli(
+        Comparison,
+        prog="python -m policies.skillmimic.mixture",
+        description="Each skill learned alone, against all of them by one policy.",
+    )
     torch.set_num_threads(1)
     skills = TASKS[a.task].skills
     ways = ("nothing learned", "alone", "all in one policy")

@@ -6,27 +6,28 @@ A candidate is judged by the training's own reward, over several randomised robo
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import sys
 import time
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import tyro
 import yaml
 from torch import Tensor
 
 from policies.mirror import joint_mirror
 from policies.skillmimic import plan
-from policies.skillmimic.config import TASKS, SkillMimic
+from policies.skillmimic.config import TASKS, SkillMimic, Task, known_skill
 from policies.skillmimic.env import Env
 from policies.skillmimic.evaluate import ticks_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.plan import KNOTS, REACH, ROOT, TIPS, Correction
+from sim2real.options import Count, Positive
 
 with warnings.catch_warnings():  # that there is no matplotlib
     warnings.simplefilter("ignore", UserWarning)
@@ -185,23 +186,32 @@ def write(file: str | Path, skill: str, c: Correction, samples: int = 0) -> None
     path.write_text(yaml.safe_dump(document, default_flow_style=None, width=120, sort_keys=True))
 
 
+@dataclass(frozen=True)
+class Args:
+    """Find the corrections of a skill's plan."""
+
+    task: tyro.conf.Positional[Task]
+    """whose settings"""
+    skill: tyro.conf.Positional[str]
+    """which of the task's"""
+    generations: Count = 40
+    """of the search"""
+    candidates: Count = 24
+    """a generation"""
+    each: Count = 16
+    """randomised robots that a candidate is judged by"""
+    seconds: Positive = 4.0
+    """of an episode that does not end by itself"""
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description="find the corrections of a skill's plan")
-    parser.add_argument("task", choices=[name for name, c in TASKS.items() if c.base])
-    parser.add_argument("skill")
-    parser.add_argument("--generations", type=int, default=40)
-    parser.add_argument("--candidates", type=int, default=24)
-    parser.add_argument("--each", type=int, default=16, help="randomised robots a candidate is judged by")
-    parser.add_argument("--seconds", type=float, default=4.0, help="of an episode that does not end by itself")
-    arguments = parser.parse_args()
-    config = TASKS[arguments.task]
-    if arguments.skill not in config.skills or config.corrections is None:
-        sys.exit(f"skill: got '{arguments.skill}', expected one of {', '.join(config.skills)}")
+    a = tyro.cli(Args, prog="python -m policies.skillmimic.optimise")
+    known_skill(a.task, a.skill)
+    config = TASKS[a.task]
+    assert config.corrections is not None  # with a base there is a plan
     torch.set_num_threads(1)
-    file, skill = config.corrections, arguments.skill
-    keep = lambda c, samples: write(file, skill, c, samples)  # noqa: E731
-    a = arguments
-    optimise(config, skill, a.generations, a.candidates, a.each, keep, a.seconds)
+    keep = lambda c, samples: write(config.corrections, a.skill, c, samples)  # noqa: E731
+    optimise(config, a.skill, a.generations, a.candidates, a.each, keep, a.seconds)
 
 
 if __name__ == "__main__":

@@ -5,14 +5,15 @@ In the training environment, as the card measures it, and then with one cause af
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
+import tyro
 
 from policies import ball
 from policies.skillmimic.ablation import tell
@@ -23,6 +24,7 @@ from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.plan import GRAVITY
 from policies.skillmimic.randomisation import TABLE
 from policies.skillmimic.starts import first_clips
+from sim2real.options import Count, MaybeNewFile
 
 SHOWN = 5  # bounces
 LOW = 0.3  # m: a ball that turns below bounces
@@ -110,13 +112,22 @@ def _spread(values: np.ndarray) -> str:
     return f"{middle:+.2f} +- {(high - low) / 2:.2f}"
 
 
+@dataclass(frozen=True)
+class Args:
+    """Where a dribble loses its ball, bounce by bounce."""
+
+    policy: tyro.conf.Positional[Path]
+    """policy file"""
+    skill: str = "dribble_in_place"
+    """which of its skills"""
+    robots: Count = 200
+    """in each case"""
+    report: MaybeNewFile = None
+    """write the table to this Markdown file"""
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("policy", type=Path)
-    parser.add_argument("--skill", default="dribble_in_place")
-    parser.add_argument("--robots", type=int, default=200)
-    parser.add_argument("--report", type=Path, help="Markdown to write the table to")
-    a = parser.parse_args()
+    a = tyro.cli(Args, prog="python -m policies.skillmimic.strokes")
     torch.set_num_threads(1)
     graph = graph_in(a.policy)
     if a.skill not in graph.labels:

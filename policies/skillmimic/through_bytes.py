@@ -17,6 +17,7 @@ import numpy as np
 from drivers.sim.ball import MASS, RADIUS
 from policies.clips.kinematics import heading, multiply, rotate
 from policies.clips.robot import POINT_NAMES
+from policies.parts import Array
 from policies.skillmimic.evaluate import Measures, Trace, measure, succeeded, ticks_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.randomisation import TABLE
@@ -239,9 +240,7 @@ def deploy_episode(
     return judge
 
 
-def judged(
-    path: Path, clip: int, seconds: float, camera: CameraModel | None, seed: int
-) -> tuple[float, np.ndarray, int]:
+def judged(path: Path, clip: int, seconds: float, camera: CameraModel | None, seed: int) -> tuple[float, Array, int]:
     """Success, sums of Measures (4,) and frames of a ``deploy_episode`` of a policy file."""
     judge = deploy_episode(path, graph_in(path), clip, seconds, camera, seed)
     return judge.success, judge.sums, judge.frames
