@@ -145,8 +145,8 @@ class Training:
 
     def start_from(self, checkpoint: Path) -> None:
         """Take the networks and the optimiser of another run; samples and curve begin at zero. Raises Sim2realError."""
+        state = load(checkpoint, "name another with --start")
         try:
-            state = torch.load(checkpoint, weights_only=True, map_location="cpu")
             self.ppo.load(state["ppo"], None, strict=True)
         except Exception as error:  # torch has no common base for what a wrong file raises
             raise Sim2realError(

@@ -12,6 +12,7 @@ from policies import ball
 from policies.skillmimic import strokes
 from policies.skillmimic.plan import GRAVITY
 from policies.skillmimic.strokes import Bounces, bounces, table
+from sim2real.simulation import Scene
 
 TICK = 0.02  # s
 
@@ -67,10 +68,18 @@ def test_a_skill_that_the_policy_has_not_is_named(monkeypatch):
 @pytest.mark.slow
 def test_the_shipped_dribble_is_told_bounce_by_bounce(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(strokes, "SECONDS", 0.6)
-    monkeypatch.setattr(strokes, "CASES", {n: strokes.CASES[n] for n in ("base held still", "nothing random")})
+    monkeypatch.setattr(
+        strokes, "CASES", {n: strokes.CASES[n] for n in ("base held still", "nothing random, finer steps")}
+    )
     report = tmp_path / "dribble.md"
     words = ["strokes", str(ROOT / "policies/g1/ball.onnx"), "--robots", "2", "--report", str(report)]
     monkeypatch.setattr(sys, "argv", words)
     strokes.main()
-    assert "base held still: 1.0 bounces a robot" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "base held still: 1.0 bounces a robot" in out and "finer steps: 1.0 bounces a robot" in out
     assert report.read_text().count("| 1 | 100% |") == 2
+
+
+def test_physics_in_finer_steps_are_those_of_the_deployed_worlds():
+    assert strokes.FINE == Scene().timestep
+    assert all(case.timestep in (0.0, strokes.FINE) for case in strokes.CASES.values())
