@@ -9,7 +9,7 @@ only proposes: the actor's residual is what keeps the robot up.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import mujoco
@@ -44,6 +44,10 @@ class Stride:
     bow: float = 0.15  # rad that a pose pitches the base, beyond which the feet stay: bent legs cannot step
     acceleration: float = 1.2  # m/s^2 (rad/s^2) of a command
     idle: float = 0.05  # m/s (rad/s): a smaller command is none
+
+    def steadier(self, times: float) -> Stride:
+        """The same of legs that step only when pushed ``times`` as far."""
+        return replace(self, ahead=self.ahead * times, behind=self.behind * times, aside=self.aside * times)
 
 
 # Of a stride, that the clock is ahead when it starts: were its steps to meet exactly 0.5 on their way, that would be a rest,

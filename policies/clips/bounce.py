@@ -78,10 +78,10 @@ class Flight(NamedTuple):
     release: float
 
     @classmethod
-    def of(cls, top: float, leave: float, peak: float, radius: float) -> Flight:
+    def of(cls, top: float, leave: float, peak: float, radius: float, restitution: float = ball.RESTITUTION) -> Flight:
         """What follows from the restitution: the ball's speeds are those that bring it to its peak."""
         off = np.sqrt(2 * GRAVITY * (peak - radius))
-        hit = off / ball.RESTITUTION
+        hit = off / restitution
         release = np.sqrt(hit**2 - 2 * GRAVITY * (leave - radius))
         return cls(top, leave, peak, 2 * (top - leave) / release, (hit - release) / GRAVITY, off / GRAVITY, release)
 
@@ -114,9 +114,11 @@ class Stroke:
     push: float = 0.2  # m that the palm stays on it
     follow: float = 0.3  # m in which the palm then comes to rest
     place: tuple[float, float] = (0.3, 0.27)  # m from the base: ahead, and to the side of the arm
+    restitution: float = ball.RESTITUTION  # that it is made for
+    from_floor: bool = False  # it begins where the ball leaves the floor, and not at its peak
 
     def flight(self, radius: float) -> Flight:
-        return Flight.of(self.peak, self.peak - self.push, self.peak, radius)
+        return Flight.of(self.peak, self.peak - self.push, self.peak, radius, self.restitution)
 
     def period(self, radius: float) -> float:
         return self.flight(radius).period
@@ -132,7 +134,8 @@ class Stroke:
     def path(self, radius: float, t: np.ndarray) -> Path:
         """The palm is never in the ball."""
         flight = self.flight(radius)
-        t = np.mod(t, flight.period)
+        off = flight.push + flight.fall + 1e-9  # when the ball has left the floor, whatever rounding says
+        t = np.mod(t + self.from_floor * off, flight.period)
         z, v = flight.at(t)
         back = flight.palms(t, self.follow, 0.0, lambda u: 3 * u**2 - 2 * u**3)
         above = np.maximum(back, z + np.minimum(CLEAR, GRAVITY * (flight.period - t) ** 2 / 4))
@@ -186,6 +189,9 @@ def eased(u: np.ndarray) -> np.ndarray:
     return u**3 * (10 - 15 * u + 6 * u**2)
 
 
+# With the arm stretched forwards, which is calmest. Somebody bounces the ball to the robot; and arms do not get as fast as
+# they are sent, so the palm pushes as if a ball came back with less.
+STRETCHED = Stroke(peak=1.0, push=0.25, follow=0.15, place=(0.4, 0.14), restitution=0.7, from_floor=True)
 # While walking. Nearer, a thigh that swings meets the ball on its way up.
 WALKING = Drop(ahead=0.25)
 

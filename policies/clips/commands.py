@@ -150,14 +150,19 @@ def _to_retarget(
 
 def _by_formula(body: RobotBody) -> Iterator[Clip]:
     """What the library of a robot has made by formula, numbered after its pieces of recordings."""
-    from policies.clips.bounce import WALKING, bounce, dribble
+    from policies.clips.bounce import STRETCHED, WALKING, bounce, dribble
     from policies.clips.pickup import pickup
 
     chosen = library.robot_library(body.robot)
     for skill, ways in chosen.formulas.items():
         for number, way in enumerate(ways, 1 + len(chosen.skills.get(skill, ()))):
             name = f"{skill}_{number:02d}"
-            made = {"both": bounce, "walking": partial(bounce, drop=WALKING), "floor": pickup}
+            made = {
+                "stretched": partial(dribble, side="right", stroke=STRETCHED),
+                "both": bounce,
+                "walking": partial(bounce, drop=WALKING),
+                "floor": pickup,
+            }
             yield made[way](body, name) if way in made else dribble(body, name, way)
 
 

@@ -111,7 +111,13 @@ class Args(Comparison):
 
     skill: tyro.conf.Positional[str] = "hold"
     """which of the task's"""
-    variants: tuple[Literal["skillmimic", "no_cgr", "no_multiplication", "deepmimic", "amp"], ...] = tuple(VARIANTS)
+    variants: tuple[Literal["skillmimic", "no_cgr", "no_multiplication", "deepmimic", "amp"], ...] = (
+        "skillmimic",
+        "no_cgr",
+        "no_multiplication",
+        "deepmimic",
+        "amp",
+    )
     """rewards to compare"""
     seeds: Literal[2, 3, 4, 5] = 3
     """runs of each reward"""

@@ -167,6 +167,7 @@ class ReferenceClips:
             velocity, pulls = np.zeros((1, 3)), np.zeros(1)
         pose = self.stance[at[: len(target)]] - self._body.robot.home_pos
         data, back = mujoco.MjData(self._model), np.zeros((len(target), len(acting), TIPS.stop))
+        meets = self._config.skills[skill] in self._config.meets
         for t in range(len(target)):
             if gone[t]:
                 continue
@@ -176,9 +177,10 @@ class ReferenceClips:
             for site in self._body.palms[self.hands[clip]]:
                 link = self._model.site_bodyid[site]
                 moves, turns = _jacobian(self._model, data, data.site_xpos[site], link)[:, :, acting]
-                back[t, :, : TIPS.start] += _inverse(moves)
                 tips = LEVER * np.array([turns[1], -turns[0]])
-                back[t, :, TIPS] += _inverse(np.concatenate([moves, tips]))[:, TIPS] * LEVER
+                level = _inverse(np.concatenate([moves, tips]))
+                back[t, :, : TIPS.start] += level[:, : TIPS.start] if meets else _inverse(moves)
+                back[t, :, TIPS] += level[:, TIPS] * LEVER
         if self.loop[clip] and self.hands[clip].all():
             share = _followed(m.contact[at, 0] > 0, velocity[:, 2] > 0, YIELD / self._config.period)
             back *= share[:, None, None]
@@ -186,7 +188,8 @@ class ReferenceClips:
         ready = loop or not (m.contact[at[0], 0] or pulls[0])
         away = (m.contact[at[: len(target)], 0] == 0) & loop & self.hands[clip].all()
         bends = self._config.skills[skill] in self._config.bends
-        return Rows(target, pose, ball_in_base, velocity, back, loop, ready, bends, away, pulls)
+        left = meets * flies[: len(target)] * np.maximum(velocity[:, 2], 0.0) / GRAVITY
+        return Rows(target, pose, ball_in_base, velocity, back, loop, ready, bends, away, pulls, left)
 
     def _gone(self, clip: int, at: np.ndarray) -> np.ndarray:
         """(rows,) bool: whether the ball has left the hands for good."""

@@ -33,6 +33,9 @@ class SkillMimic:
     corrections: str | None = None  # of the plan of the arms (plan.py), a file; only with a base
     # skills in which the clip waits: for the ball, or for arms to be where it begins
     timed: tuple[str, ...] = ("catch", "dribble_in_place", "bounce", "bounce_walk", "pickup")
+    # skills in which one palm, kept level, goes to where it will meet the ball that comes up
+    meets: tuple[str, ...] = ()
+    stands: float = 1.0  # times as far as else the base is pushed before it steps
     # skills during which the base obeys velocity commands, and those it is trained on, from and to (forward m/s, left m/s,
     # turn rad/s); None: its own
     walks: dict[str, Sequence[Sequence[float]] | None] = field(default_factory=dict)
@@ -56,6 +59,8 @@ class SkillMimic:
     timestep: float = 0.005  # s of the physics
     frames: int = 60  # ticks in an episode, as in the paper: 1.2 s here, 1.4 s of the recorded motion
     disturbed: float = 0.5  # share of episodes that start beside their reference frame
+    # share of every range of the randomisation that training begins with; it widens while more than half survive
+    easy: float = 1.0
     # m/s, the most by which a ball that flies at the start does so otherwise than in the clip, each way
     throw: float = 0.1
     placed: float = 0.05  # m, the most by which a ball that lies there does so elsewhere, each way
@@ -89,6 +94,7 @@ class SkillMimic:
 
 
 BASE, DOWN, PLAN = "policies/g1/basics.pt", "policies/g1/down.pt", "policies/g1/plan.yaml"
+DRIBBLE = "policies/g1/dribble.yaml"
 BALL = {  # a clip each: the calmest, and those that come from and go to the front
     "hold": "hold_01",
     "carry": "carry_01",
@@ -99,12 +105,17 @@ BALL = {  # a clip each: the calmest, and those that come from and go to the fro
     "bounce_walk": "bounce_walk_01",
 }
 WALKS = {"carry": None, "bounce_walk": ((0.1, -0.1, -0.3), (0.3, 0.1, 0.3))}
-Task = Literal["g1-ball", "g1-pickup"]  # the keys of TASKS
+Task = Literal["g1-ball", "g1-dribble", "g1-pickup"]  # the keys of TASKS
 # Small steps from a plan that works; each task then looks every few iterations at what is best.
 GENTLE = SkillMimic(corrections=PLAN, push_chance=0.004, learning_rate=3e-4, std=0.1)
 TASKS: dict[str, SkillMimic] = {
     "g1-ball": replace(GENTLE, base=BASE, skills=tuple(BALL), clips=tuple(BALL.values()), walks=WALKS, frames=200,
                        samples=0.86e6, save_every=20, evaluate_every=20, evaluate_envs=48),
+    # The physics in the deployed worlds' steps: in longer ones chance decides where a ball goes that a palm has pushed.
+    "g1-dribble": replace(GENTLE, base=BASE, skills=("dribble_in_place",), clips=("dribble_in_place_03",), corrections=DRIBBLE,
+                          meets=("dribble_in_place",), stands=3.0, variant="bounces", timestep=0.002, easy=0.15, frames=200,
+                          disturbed=0.3, push_chance=0.0, gamma=0.99, std=0.2, ppo={**GENTLE.ppo, "schedule": "adaptive"},
+                          samples=30e6, save_every=20, evaluate_every=200, evaluate_envs=96, evaluate_seconds=10.0),
     "g1-pickup": replace(GENTLE, base=DOWN, skills=("pickup",), clips=("pickup_09",), frames=400,
                          samples=0.4e6, save_every=8, evaluate_every=8, evaluate_envs=64),
 }  # fmt: skip

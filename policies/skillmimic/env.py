@@ -34,6 +34,7 @@ from sim2real.object.scene import AIMING
 from sim2real.types import Sim2realError
 
 BASE, JOINTS, BALL = slice(0, 7), slice(7, -7), slice(-7, -4)  # of qpos
+WIDENS = 0.2  # of the curriculum's level, where every robot survives an episode
 SPIN, RATES, FLIGHT = slice(3, 6), slice(6, -6), slice(-6, -3)  # of qvel
 
 
@@ -43,8 +44,6 @@ class Env(VecEnv):
     An episode lasts ``config.frames`` ticks; of a clip that ends, at most ``config.after`` s beyond its end. From there on
     the last frame is what is imitated, but for a ball in flight, which then may be anywhere.
     """
-
-    level = None  # no push curriculum here
 
     def __init__(self, config: SkillMimic, seed: int, graph: PolicyGraph | None = None, skill: str = "") -> None:
         """``skill``: only this one of the policy's, whatever ``config.practise`` says."""
@@ -57,6 +56,8 @@ class Env(VecEnv):
         if strangers := [name for name in chosen if name not in config.skills]:
             raise Sim2realError(f"practise: got '{strangers[0]}', expected some of {', '.join(config.skills)}")
         self.skills = [k for k, name in enumerate(config.skills) if name in chosen]
+        # Of a curriculum: 0 draws ``config.easy`` of every range of the randomisation, 1 all of it.
+        self.level: float | None = 0.0 if config.easy < 1 else None
         self.rng = np.random.default_rng(seed)
         self.num_envs = n = config.envs
         self.num_actions, joints = len(self.graph.acting), len(self.graph.joint_names)
@@ -65,6 +66,7 @@ class Env(VecEnv):
         self.substeps = round(config.period / config.timestep)
         self.batch = Batch(self.model, n, config.threads)
         self.random = Randomisation(self.batch, self.model)
+        self._widen(0, 0)
         timed = np.array([name in config.timed for name in config.skills])
         self._timed = timed[self.clips.skill]  # whose clock is the plan's
         self._ends = ~(self.clips.swing | self.clips.loop)
@@ -125,6 +127,7 @@ class Env(VecEnv):
         over |= self._ends[self.clip] & (beyond * self.config.timestep >= self.config.after)
         timeouts = over & ~self.failures
         self._push()
+        self._widen(int(timeouts.sum()), int(self.failures.sum()))
         self._start(np.flatnonzero(over | self.failures))
         self._observe()
         extras = {"time_outs": torch.from_numpy(timeouts), "observations": {}}
@@ -141,10 +144,12 @@ class Env(VecEnv):
     def state_dict(self) -> dict:
         """What a resumed run needs; call ``reset`` on both sides of a checkpoint and they continue alike."""
         more = {} if self.discriminator is None else {"discriminator": self.discriminator.state_dict()}
-        return {"rng": self.rng.bit_generator.state, **more}
+        return {"rng": self.rng.bit_generator.state, "level": self.level, **more}
 
     def load_state_dict(self, state: dict) -> None:
         self.rng.bit_generator.state = state["rng"]
+        self.level = state.get("level", self.level)
+        self._widen(0, 0)
         if self.discriminator is not None:
             self.discriminator.load_state_dict(state["discriminator"])
         self.reset()
@@ -311,6 +316,12 @@ class Env(VecEnv):
         return np.clip(np.concatenate(columns, axis=1), -10, 10)
 
     # between periods
+
+    def _widen(self, survived: int, fell: int) -> None:
+        """Draw from more of every range while more than half of the episodes survive."""
+        if self.level is not None:
+            self.level = float(np.clip(self.level + WIDENS * (survived - fell) / self.num_envs, 0.0, 1.0))
+            self.random.share = self.config.easy + (1 - self.config.easy) * self.level
 
     def _push(self) -> None:
         config, rng = self.config, self.rng

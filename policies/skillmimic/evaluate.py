@@ -120,9 +120,10 @@ def rule_of(skill: str) -> Callable[[Trace, float, int], float]:
     return RULES.get(skill, _kept)
 
 
-def succeeded(skill: str, trace: Trace, period: float, ticks: int) -> float:
-    """By the skill's rule."""
-    return rule_of(skill)(trace, period, ticks)
+def succeeded(skill: str, trace: Trace, period: float, ticks: int, aimed: int = 0) -> float:
+    """By the skill's rule. ``aimed``: frames at the beginning in which somebody aims the ball, which are nobody's merit."""
+    performed = Trace(*(column[aimed:] for column in trace))
+    return rule_of(skill)(performed, period, ticks - aimed) if len(performed.up) else 0.0
 
 
 def ticks_of(graph: PolicyGraph, clip: int, seconds: float) -> int:
@@ -132,6 +133,11 @@ def ticks_of(graph: PolicyGraph, clip: int, seconds: float) -> int:
     if not (clips.swing[clip] or clips.loop[clip]):
         seconds = min(seconds, (clips.length[clip] - 1) * config.timestep + config.after)
     return math.ceil((seconds + aiming(graph, clip)) / config.period - 1e-6)
+
+
+def ticks_aimed(graph: PolicyGraph, clip: int) -> int:
+    """Of these, how many the ball of clip number ``clip`` is aimed for."""
+    return round(aiming(graph, clip) / graph.config.period)
 
 
 class Result(NamedTuple):
@@ -203,8 +209,9 @@ def performed(
             running &= ~dones.numpy().astype(bool)
     everything = Trace(*(np.stack(values) for values in zip(*rows, strict=True)))
     ticks = {clip: ticks_of(graph, clip, seconds) for clip in np.unique(clips)}
+    aimed = {clip: ticks_aimed(graph, clip) for clip in ticks}
     shares = [
-        succeeded(skill, Trace(*(x[:end, n] for x in everything)), config.period, ticks[clips[n]])
+        succeeded(skill, Trace(*(x[:end, n] for x in everything)), config.period, ticks[clips[n]], aimed[clips[n]])
         for n, end in enumerate(frames)
     ]
     return Episodes(np.array(shares), sums, frames)
@@ -229,6 +236,7 @@ def episodes_of(
         push_chance=graph.config.push_chance if push else 0.0,
         anywhere=skill not in RULES,
         disturbed=0.0,
+        easy=1.0,
     )
     env = Env(config, UNSEEN + seed, graph, skill)
     if fixed:

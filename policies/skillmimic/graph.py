@@ -62,6 +62,7 @@ class PolicyGraph(nn.Module):
         crouch = None
         if self.base is not None:
             self.base.requires_grad_(False)
+            self.base.gait.stride = self.base.gait.stride.steadier(config.stands)
             legs = np.array([j.group == "leg" for j in robot.joints])
             crouch = self.base.references.lift[self.base.labels.index("squat")].numpy() * legs
         self.model, self.contact_graph = training_world(robot, self.body, self.kp, self.kd, config.timestep)

@@ -149,7 +149,9 @@ def optimise(
     ``keep`` is given the middle of the search's distribution after every generation, and how many samples that took. Prints
     a line for each. ``seconds``: of an episode that does not end by itself.
     """
-    config = dataclasses.replace(config, skills=(skill,), envs=candidates * each, anywhere=False, push_chance=0.0)
+    config = dataclasses.replace(
+        config, skills=(skill,), envs=candidates * each, anywhere=False, push_chance=0.0, easy=1.0
+    )
     graph = PolicyGraph(config)
     ticks = ticks_of(graph, 0, seconds)
     env = Env(dataclasses.replace(config, frames=ticks), seed, graph)

@@ -60,6 +60,7 @@ class Rows:
     bends: bool  # it moves the base
     away: np.ndarray  # (T,) bool: the ball comes back to both hands, and until then nothing else can begin
     pull: np.ndarray  # (T,) rows a tick per s that the ball is ahead, of a clock that follows it; 0: it runs by itself
+    left: np.ndarray  # (T,) s for which the ball still rises: a palm that comes from above then meets it
     knots: np.ndarray = field(init=False)  # (T, KNOTS) shares of the knots in each row
 
     def __post_init__(self) -> None:
@@ -108,7 +109,9 @@ class Plan(nn.Module):
         following = np.arange(lengths.sum()) + 1
         for begin, count, r in zip(first, lengths, rows, strict=True):
             following[begin + count - 1] = begin if r.loop else begin + count - 1
-        tables = [np.concatenate([r.target, r.ball, r.velocity, r.pull[:, None]], axis=1) for r in rows]
+        tables = [
+            np.concatenate([r.target, r.ball, r.velocity, r.pull[:, None], r.left[:, None]], axis=1) for r in rows
+        ]
         self.register_buffer("table", _buffer(np.concatenate(tables)))
         self.register_buffer("knots", _buffer(np.concatenate([r.knots for r in rows])))
         self.register_buffer("back", _buffer(np.concatenate([r.back for r in rows])))
@@ -162,7 +165,8 @@ class Plan(nn.Module):
         planned = mixed(self.table)
         error = ball - planned[:, self.arms : self.arms + 6]
         offsets, gains = self.corrections(skill)
-        place, speed = error[:, :3], error[:, 3:]
+        speed = error[:, 3:]
+        place = error[:, :3] + planned[:, self.arms + 7 :] * speed  # where the palm will meet it
         moved = torch.cat([place, place[:, :2], speed, speed[:, :2]], dim=-1) * gains
         waits = (rate <= 0) & (same > 0) & (loop == 0)  # for a ball that is still somewhere else
         wanted = moved[:, : TIPS.stop] + moved[:, TIPS.stop :]
@@ -196,13 +200,16 @@ class Plan(nn.Module):
         fallen = (velocity[:, 2:] - ball[:, 5:6]) / GRAVITY
         bounce = skill @ self.bounce
         ahead = torch.where(loop > 0, fallen - bounce * torch.round(fallen / bounce), along)  # s
-        rate = torch.clamp(same + planned[:, 6:] * ahead, 0.0, 2.0)
+        rate = torch.clamp(same + planned[:, 6:7] * ahead, 0.0, 2.0)
         # Rows that targets are on their way to, now and then: hands that have begun to open do not stop half-way.
         most = len(self.away) - 1
         after, soon = (row + 1).clamp(max=most), (self._row(skill, clock + rate) + 1).clamp(max=most)
         lets_go = (self.away[after] == 0) & (self.away[soon] > 0)
         settles = (clock < 0) & (skill @ self.settle > 0)
-        rate = torch.where((lets_go | settles) & ~calm, 0.0, rate)
+        # Somebody still holds the ball that is to bounce.
+        slow, fast = ((v * v).sum(-1, keepdim=True) for v in (ball[:, 3:], velocity))
+        held = (loop > 0) & (clock >= 0) & (clock < 1) & (slow < SLOW**2) & (fast > (4 * SLOW) ** 2)
+        rate = torch.where(((lets_go | settles) & ~calm) | held, 0.0, rate)
         moved = clock + rate
         around = moved - (last + 1) * torch.clamp(torch.floor(moved / (last + 1)), min=0.0)
         return torch.where(loop > 0, around, torch.minimum(moved, last)), rate

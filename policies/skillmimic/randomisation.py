@@ -89,7 +89,10 @@ EXPANDED = ("geom_friction", "body_mass", "body_inertia", "body_ipos", "actuator
 
 class Randomisation:
     """Draws the table for the simulations of a batch. ``drawn[name]``: (sims, size); ``fixed[name]`` (sims,), which may
-    be changed between draws, is what a term is instead, where it is not NaN."""
+    be changed between draws, is what a term is instead, where it is not NaN. ``share``, too, may be changed: that of every
+    range that is drawn from, around its middle, or from its beginning if that is nothing at all."""
+
+    share = 1.0
 
     def __init__(self, batch: Batch, model: mujoco.MjModel) -> None:
         self.fixed: dict[str, np.ndarray] = {}
@@ -103,6 +106,9 @@ class Randomisation:
         """New robots, balls and trackers in the simulations ``ids`` (k,)."""
         for name, term in TABLE.items():
             x = rng.uniform(term.low, term.high, (len(ids), self._sizes[name]))
+            if self.share < 1:
+                middle = (term.low + term.high) / 2 if term.low else 0.0
+                x = middle + self.share * (x - middle)
             if name in self.fixed:
                 given = self.fixed[name][ids, None]
                 x = np.where(np.isnan(given), x, given)

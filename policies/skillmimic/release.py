@@ -30,7 +30,7 @@ from sim2real.types import Sim2realError
 
 SETTINGS = ("robot", "skills", "clips", "swing", "loop", "after", "base", "walks", "bends", "corrections", "timed", "period",
             "timestep", "action_ratio", "action_max", "grip", "balance_gain", "balance_damping", "position_margin",
-            "history", "frames", "throw", "placed", "terminations")  # fmt: skip
+            "history", "frames", "throw", "placed", "terminations", "meets", "stands")  # fmt: skip
 ARMS_COME = 1.0  # s, at most, until arms are where a clip begins
 SHOWN, NONE = (0.3, 0.0, 0.0), (0.0, 0.0, 0.0)  # m/s, m/s, rad/s: of a timeline that names none, at most
 GOLDEN_STEPS, GOLDEN = 40, 4  # ticks of each golden sequence, and how many

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from policies.skillmimic.rewards import Step
+from policies.skillmimic.rewards import Step, off
 
 # m between ball and its reference, seen from the first key point, while the reference has it in hand; of a ball that
 # bounces, at any time and over the floor: after that one the robot can still go
@@ -21,8 +21,7 @@ def up(orientation_base_in_world: np.ndarray) -> np.ndarray:
 
 
 def _ball_lost(s: Step) -> np.ndarray:
-    here, there = (m.object_position - m.points[:, 0] for m in (s.state, s.reference))
-    away = (here - there) * np.where(s.bounces[:, None], [1.0, 1.0, 0.0], 1.0)
+    away = off(s) * np.where(s.bounces[:, None], [1.0, 1.0, 0.0], 1.0)
     limit = np.where(s.bounces, BALL_GONE, BALL_LOST)
     return (s.bounces | (s.reference.contact[:, 0] > 0)) & (np.linalg.norm(away, axis=1) > limit)
 

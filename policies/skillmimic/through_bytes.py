@@ -18,7 +18,7 @@ from drivers.sim.ball import MASS, RADIUS
 from policies.clips.kinematics import heading, multiply, rotate
 from policies.clips.robot import POINT_NAMES
 from policies.parts import Array
-from policies.skillmimic.evaluate import Measures, Trace, measure, succeeded, ticks_of
+from policies.skillmimic.evaluate import Measures, Trace, measure, succeeded, ticks_aimed, ticks_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.randomisation import TABLE
 from policies.skillmimic.release import NONE, graph_of
@@ -64,7 +64,8 @@ class Judge:
             return 0.0
         trace = Trace(*(np.array(column) for column in zip(*self._rows, strict=True)))
         trace.up[-1] &= not self.failed  # a fault shows only when all is over
-        return succeeded(self.label, trace, self.graph.config.period, self.ticks)
+        aimed = ticks_aimed(self.graph, self.clip)
+        return succeeded(self.label, trace, self.graph.config.period, self.ticks, aimed)
 
     def __call__(self, simulation: Simulation) -> None:
         body = self._read = self._read or _Body(self.graph, simulation.world.plant)

@@ -18,7 +18,7 @@ class Args:
     """Train a policy in simulation: config, curve and checkpoints go to a folder, from which a second call resumes."""
 
     task: tyro.conf.Positional[str]
-    """what to train: g1-basics, g1-down, g1-ball or g1-pickup"""
+    """what to train: g1-basics, g1-down, g1-ball, g1-dribble or g1-pickup"""
     folder: MaybeNewFolder = None
     """where the run lives; default: runs/<task>"""
     samples: MaybePositive = None

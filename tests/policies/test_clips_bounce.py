@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from policies import ball
-from policies.clips.bounce import GRAVITY, Drop, Flight, Stroke
+from policies.clips.bounce import GRAVITY, STRETCHED, Drop, Flight, Stroke
 from policies.clips.library import library_path, load_clip
 from policies.clips.robot import SIDES, RobotBody
 from sim2real.config import load_robot
@@ -38,6 +38,16 @@ def test_a_path_moves_as_it_says_and_falls_where_nobody_touches_the_ball(motion)
     np.testing.assert_allclose(path.palm[path.on], path.ball[path.on])
     assert (path.apart[path.on] == 0).all()
     np.testing.assert_allclose(motion.path(R, t + period).ball, path.ball, atol=1e-9)
+
+
+def test_a_stroke_may_be_made_for_another_floor_and_begin_on_it():
+    k = STRETCHED.flight(R)
+    _, v = k.at(np.array([k.push + k.fall - 1e-9, k.push + k.fall + 1e-9]))
+    assert v[1] == pytest.approx(-STRETCHED.restitution * v[0])
+    path = STRETCHED.path(R, np.array([0.0, k.rise, k.period]))
+    np.testing.assert_allclose(path.ball, [R, STRETCHED.peak, R], atol=1e-6)
+    np.testing.assert_allclose(path.velocity, [v[1], 0.0, v[1]], atol=1e-6)
+    assert list(path.on) == [False, True, False]
 
 
 def test_a_palm_from_above_is_never_in_the_ball():

@@ -12,8 +12,9 @@ import torch
 from policies import ball
 from policies.skillmimic.config import TASKS, SkillMimic
 from policies.skillmimic.env import BALL, JOINTS, Env
-from policies.skillmimic.evaluate import evaluate, measure
+from policies.skillmimic.evaluate import episodes_of, evaluate, measure
 from policies.skillmimic.graph import PolicyGraph
+from policies.skillmimic.randomisation import TABLE
 from policies.skillmimic.sight import Sight
 from policies.skillmimic.starts import thrown
 from policies.skillmimic.terminations import TERMINATIONS
@@ -279,6 +280,42 @@ def test_every_ball_is_another_ball(env):
         np.testing.assert_allclose(fields["geom_solref"][k, g], [-law.stiffness, -law.damping])
     assert len(np.unique(drawn["ball_friction"])) == env.num_envs
     np.testing.assert_allclose(fields["geom_size"][0, :g], model.geom_size[:g])  # the robot keeps its shape
+
+
+@pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
+def test_a_curriculum_draws_from_a_share_of_every_range(graph, level):
+    env = Env(dataclasses.replace(CONFIG, easy=0.2, envs=64), 3, graph)
+    env.level = level
+    env._widen(0, 0)
+    env.reset()
+    share = 0.2 + 0.8 * level
+    for name, term in TABLE.items():
+        middle = (term.low + term.high) / 2 if term.low else 0.0
+        low, high = (middle + share * (x - middle) for x in (term.low, term.high))
+        drawn = env.random.drawn[name]
+        assert drawn.min() >= low - 1e-12 and drawn.max() <= high + 1e-12
+        assert np.ptp(drawn) > 0.8 * (high - low)
+
+
+def test_a_curriculum_goes_on_while_more_than_half_survive_and_is_kept(graph):
+    env = Env(dataclasses.replace(CONFIG, easy=0.2), 3, graph)
+    assert env.level == 0.0 and env.random.share == 0.2
+    env._widen(env.num_envs, 0)
+    assert env.level == pytest.approx(0.2) and env.random.share == pytest.approx(0.36)
+    other = Env(env.config, 4, graph)
+    other.load_state_dict(env.state_dict())
+    assert other.random.share == pytest.approx(0.36)
+    env._widen(0, 2 * env.num_envs)
+    assert env.level == 0.0
+
+
+def test_without_a_curriculum_and_in_an_evaluation_all_of_every_range_is_drawn_from(graph):
+    assert Env(CONFIG, 3, graph).level is None
+    graph.config, config = dataclasses.replace(graph.config, easy=0.2), graph.config
+    try:
+        assert episodes_of(graph, "hold", 2, 0.1).random.share == 1.0
+    finally:
+        graph.config = config
 
 
 def test_evaluation_counts_episodes_and_frames(graph):

@@ -40,7 +40,19 @@ def rows(loop: bool = False, pull: float = 0.0, ready: bool = False, bends: bool
     back[:, 1, 4] = 1.0  # and the second to the left
     target, pose = np.column_stack([t * 0.1, np.zeros(T)]), np.column_stack([-t * 0.2, np.zeros(T), np.zeros(T)])
     velocity = np.tile([1.0, 0, 0], (T, 1))
-    return Rows(target, pose, ball, velocity, back, loop, loop or ready, bends, np.arange(T) >= away, np.full(T, pull))
+    return Rows(
+        target,
+        pose,
+        ball,
+        velocity,
+        back,
+        loop,
+        loop or ready,
+        bends,
+        np.arange(T) >= away,
+        np.full(T, pull),
+        np.zeros(T),
+    )
 
 
 def correction(offset: float = 0.0, follow: list[float] = NONE, damp: list[float] = NONE) -> Correction:
@@ -113,6 +125,30 @@ def test_palms_follow_a_ball_that_is_elsewhere_as_far_as_they_reach():
     off = [0.08, 0.0, 0.04, 1.0, 0.0, 0.2]  # 4 cm up, and on its way at 0.2 m/s
     np.testing.assert_allclose(at(plan, 3.0, off).target, [[0.4, 2.0 * (0.5 * 0.04 + 0.1 * 0.2)]], atol=1e-6)
     np.testing.assert_allclose(at(plan, 3.0, [0, 0, 9, 1, 0, 0]).target, [[0.4, 2.0 * REACH[2]]], atol=1e-6)
+
+
+def test_a_palm_that_meets_a_ball_goes_to_where_that_will_be():
+    meets = rows()
+    meets.left[:] = 0.3
+    meets.back[:, 1, 0] = 2.0  # a metre ahead is two radians of the second joint
+    off = [0.08 + 0.01, 0.0, 0.0, 1.2, 0.0, 0.0]  # 1 cm ahead, and 0.2 m/s too fast for 0.3 s
+    p = at(Plan([meets], [correction(follow=[0.5, 0.0, 0.0, 0.0, 0.0])]), 3.0, off)
+    np.testing.assert_allclose(p.target, [[0.4, 2.0 * 0.5 * (0.01 + 0.3 * 0.2)]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("clock", "speed", "after"), [(0.0, 0.0, 0.0), (0.0, 4.0, 1.0), (3.0, 0.0, 4.0), (-2.0, 0.0, -1.0)]
+)
+def test_a_bounce_waits_at_its_beginning_for_whoever_holds_the_ball(clock, speed, after):
+    some = rows(loop=True)
+    some.velocity[:] = [0.0, 0.0, 4.0]
+    assert float(at(Plan([some], [correction()]), clock, [0.0, 0.0, 0.0, 0.0, 0.0, speed]).clock) == after
+
+
+def test_a_bounce_that_begins_with_a_ball_at_rest_waits_for_nobody():
+    some = rows(loop=True)
+    some.velocity[:] = 0.0
+    assert float(at(Plan([some], [correction()]), 0.0, [0.0] * 6).clock) == 1.0
 
 
 def test_palms_tip_after_a_ball_that_runs_away():
@@ -360,3 +396,32 @@ def test_a_tipped_palm_turns_and_stays_where_it_is(graph):
     np.testing.assert_allclose((forwards - flat)[:2], [-0.05, 0.0], atol=0.015)
     np.testing.assert_allclose((left - flat)[:2], [0.0, -0.05], atol=0.015)
     assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 0.005
+
+
+def test_a_palm_that_meets_a_ball_stays_level_and_is_told_how_long_that_rises():
+    config = dataclasses.replace(TASKS["g1-dribble"], threads=1, corrections=None)
+    graphs = {meets: PolicyGraph(dataclasses.replace(config, meets=meets)) for meets in (config.meets, ())}
+    tilts = {}
+    for meets, graph in graphs.items():
+        (plan, clips), data = (graph.plan, graph.clips), mujoco.MjData(graph.model)
+        palm = graph.model.site("right_palm").id
+        joints = 7 + np.array(graph.acting)
+        data.qpos[:] = clips.qpos[0]
+        mujoco.mj_kinematics(graph.model, data)
+        before, there = data.site_xmat[palm].reshape(3, 3)[:, 2].copy(), data.site_xpos[palm].copy()
+        data.qpos[joints] -= plan.back[0, :, 2].numpy() * 0.02
+        mujoco.mj_kinematics(graph.model, data)
+        tilts[meets] = np.linalg.norm(data.site_xmat[palm].reshape(3, 3)[:, 2] - before)
+        assert -0.025 < (data.site_xpos[palm] - there)[2] < -0.01  # damped: the arm is stretched
+    level, free = tilts.values()
+    assert level < 0.3 * free
+    left, rises = (graphs[config.meets].plan.table[:, k].numpy() for k in (-1, -3))
+    np.testing.assert_allclose(left, np.maximum(rises, 0) / 9.81 * (left > 0), atol=1e-6)
+    assert 0.4 < left[0] < 0.46 and (left[rises < 0] == 0).all()
+    assert not graphs[()].plan.table[:, -1].any()
+
+
+def test_a_base_that_is_to_stand_steps_later():
+    strides = [PolicyGraph(dataclasses.replace(TASKS["g1-dribble"], stands=k)).base.gait.stride for k in (1.0, 3.0)]
+    usual, steady = ((s.ahead, s.behind, s.aside) for s in strides)
+    np.testing.assert_allclose(steady, 3 * np.array(usual))

@@ -113,3 +113,34 @@ def test_the_released_code_forgives_the_ball():
     s = step(motion(object_position=np.full((N, 3), 0.3)))
     assert terms_of(s, CODE)["object"] == pytest.approx(np.exp(-0.09))
     assert terms_of(s, PAPER)["object"] == pytest.approx(np.exp(-1.8))
+
+
+@pytest.mark.parametrize(
+    ("changed", "value", "term", "expected"),
+    [
+        ("object_position", [0.1, 0.0, 0.0], "beside", np.exp(-((0.1 / 0.2) ** 2))),
+        ("object_velocity", [0.0, 0.5, 0.0], "straight", np.exp(-1)),
+        ("object_position", [0.0, 0.0, -0.2], "lively", np.exp(-1)),  # as a height: too low costs more than too high
+        ("object_position", [0.0, 0.0, 0.3], "lively", np.exp(-1)),
+        ("object_velocity", [0.0, 0.0, 2.0], "lively", np.exp(-((4 / 2 / 9.81 / 0.3) ** 2))),
+    ],
+)
+def test_a_bounced_ball_goes_up_and_down_at_its_place(changed, value, term, expected):
+    s = step(motion(**{changed: np.tile(value, (N, 1))}))
+    found = terms_of(s, ROBOT, "bounces")
+    assert found[term] == pytest.approx(expected)
+    assert all(x == pytest.approx(1.0) for name, x in found.items() if name != term)
+
+
+@pytest.mark.parametrize("whose", ["state", "reference"])
+def test_the_energy_of_a_ball_in_the_hand_is_nobodys_business(whose):
+    s = step(motion(object_position=np.tile([0.0, 0.0, -0.5], (N, 1))))
+    s = s._replace(**{whose: getattr(s, whose)._replace(contact=np.ones((N, E)))})
+    assert terms_of(s, ROBOT, "bounces")["lively"] == 1.0
+
+
+def test_what_a_bounced_ball_is_worth():
+    s = step(motion(object_position=np.tile([0.2, 0.0, 0.0], (N, 1))), action_change=np.full((N, A), 1.0))
+    near = np.exp(-1)
+    expected = (0.1 + 0.3 * near + 0.2 + 0.2 + 0.2 * near) * np.exp(-0.1)
+    assert reward(s, "bounces", ROBOT)[0][0] == pytest.approx(expected)

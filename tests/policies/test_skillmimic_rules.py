@@ -74,6 +74,14 @@ def test_dribbling_counts_frames_of_all_that_were_due():
     assert success("dribble_in_place", trace(touches, height=0.35)) == 0
 
 
+def test_frames_in_which_somebody_aims_the_ball_do_not_count():
+    touches = np.arange(TICKS) >= 40
+    assert succeeded("dribble_in_place", trace(touches), PERIOD, TICKS, aimed=40) == 1
+    late = trace(touches[:70], up=np.arange(70) < 69)
+    assert succeeded("dribble_in_place", late, PERIOD, TICKS, aimed=40) == pytest.approx(29 / 60)
+    assert succeeded("dribble_in_place", trace(touches[:30]), PERIOD, TICKS, aimed=40) == 0
+
+
 def test_a_ball_nobody_touches_any_more_is_not_dribbled():
     once = np.arange(200) == 0
     assert succeeded("dribble_in_place", trace(once), PERIOD, 200) == pytest.approx(0.5)
