@@ -113,7 +113,7 @@ TASKS: dict[str, SkillMimic] = {
                        samples=0.86e6, save_every=20, evaluate_every=20, evaluate_envs=48),
     # The physics in the deployed worlds' steps: in longer ones chance decides where a ball goes that a palm has pushed.
     "g1-dribble": replace(GENTLE, base=BASE, skills=("dribble_in_place",), clips=("dribble_in_place_03",), corrections=DRIBBLE,
-                          meets=("dribble_in_place",), stands=3.0, variant="bounces", timestep=0.002, easy=0.15, frames=200,
+                          meets=("dribble_in_place",), stands=2.0, variant="bounces", timestep=0.002, easy=0.15, frames=200,
                           disturbed=0.3, push_chance=0.0, gamma=0.99, std=0.2, ppo={**GENTLE.ppo, "schedule": "adaptive"},
                           samples=30e6, save_every=20, evaluate_every=200, evaluate_envs=96, evaluate_seconds=10.0),
     "g1-pickup": replace(GENTLE, base=DOWN, skills=("pickup",), clips=("pickup_09",), frames=400,
