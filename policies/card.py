@@ -198,14 +198,15 @@ def eval_command(
     from rich.table import Table
 
     console = Console()
-    contract = load_policy(file).contract
+    policy = load_policy(file)
+    contract = policy.contract
     if contract.object is not None:
         from policies.skillmimic.card import eval_command as eval_ball_skills
 
         return eval_ball_skills(file, episodes, deployed, report, card_file, **of_ball_skills)
     if given := [f"--{name}" for name, value in of_ball_skills.items() if value]:
         raise Sim2realError(f"{', '.join(given)}: belongs to ball skills, and {file} handles no ball; drop it")
-    with kept(console, file.stem, file.read_bytes(), episodes, deployed) as parts:
+    with kept(console, file.stem, policy.sha256, episodes, deployed) as parts:
         e = evaluate(file, Basics(), episodes, deployed, parts)
     table = Table(title=f"{contract.name}: survival of {SECONDS:g} s (95 % confidence)", box=None)
     for column in ("skill", "undisturbed", f"pushed to {PUSH:g} m/s", "joint error"):

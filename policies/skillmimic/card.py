@@ -267,7 +267,8 @@ def eval_command(
     from rich.console import Console
 
     console = Console()
-    contract = load_policy(file).contract
+    policy = load_policy(file)
+    contract = policy.contract
     curve = read(runs) if runs else None
     pictures: dict[str, str] = {}
     if videos:  # first, so that a machine without OpenGL says so at once
@@ -280,7 +281,7 @@ def eval_command(
             shown = film(file, graph, label, gif)
             console.print(f"{gif}: {f'run {shown}, the first good one' if shown else 'no good run among those tried'}")
             pictures[label] = _link(gif, card_file)
-    with kept(console, file.stem, file.read_bytes(), episodes, deployed, tables) as parts:
+    with kept(console, file.stem, policy.sha256, episodes, deployed, tables) as parts:
         e = evaluate(file, episodes, deployed, parts, tables)
     show(console, contract, e)
     if report:
