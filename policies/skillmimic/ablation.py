@@ -19,7 +19,7 @@ import tyro
 
 from policies.evaluate import Rate
 from policies.skillmimic.card import SECONDS
-from policies.skillmimic.config import TASKS, SkillMimic, Task, known_skill
+from policies.skillmimic.config import TASKS, SkillMimic, Task, check_skill
 from policies.skillmimic.evaluate import Result, performed
 from policies.skillmimic.rewards import SENSITIVITIES, VARIANTS
 from policies.skillmimic.train import SkillTraining, load_graph
@@ -89,7 +89,7 @@ def table(found: dict[str, list[Result]]) -> str:
     return head + "\n".join(rows)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Comparison:
     """What every comparison asks for."""
 
@@ -105,11 +105,11 @@ class Comparison:
     """write the table to this Markdown file"""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Args(Comparison):
     """The paper's Table 1 on one skill."""
 
-    skill: tyro.conf.Positional[str] = "hold"
+    skill: tyro.conf.Positional[str]
     """which of the task's"""
     variants: tuple[Literal["skillmimic", "no_cgr", "no_multiplication", "deepmimic", "amp"], ...] = (
         "skillmimic",
@@ -132,7 +132,7 @@ def tell(text: str, report: Path | None, head: str, note: str) -> None:
 
 def main() -> None:
     a = tyro.cli(Args, prog="python -m policies.skillmimic.ablation")
-    known_skill(a.task, a.skill)
+    check_skill(a.skill, TASKS[a.task].skills)
     torch.set_num_threads(1)
     found: dict[str, list[Result]] = {variant: [] for variant in a.variants}
     for seed in range(1, a.seeds + 1):

@@ -276,7 +276,7 @@ def eval_command(
 
         graph = graph_of(contract)
         for label in contract.skill_labels:
-            console.print(f"[dim]{label}: a film ...[/]")
+            Parts(console).say(f"{label}: a film")
             gif = videos / f"{label}.gif"
             shown = film(file, graph, label, gif)
             console.print(f"{gif}: {f'run {shown}, the first good one' if shown else 'no good run among those tried'}")

@@ -121,7 +121,7 @@ TASKS: dict[str, SkillMimic] = {
 }  # fmt: skip
 
 
-def known_skill(task: str, skill: str) -> None:
-    """Ends the program, with a word of what is known, for a ``skill`` that ``task`` has not."""
-    if skill not in TASKS[task].skills:
-        sys.exit(f"skill: got '{skill}', expected one of {', '.join(TASKS[task].skills)}")
+def check_skill(skill: str, known: Sequence[str]) -> None:
+    """Ends the program, with a word of what is ``known``, for another ``skill``."""
+    if skill not in known:
+        sys.exit(f"skill: got '{skill}', expected one of {', '.join(known)}")

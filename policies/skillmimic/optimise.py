@@ -22,7 +22,7 @@ from torch import Tensor
 
 from policies.mirror import joint_mirror
 from policies.skillmimic import plan
-from policies.skillmimic.config import TASKS, SkillMimic, Task, known_skill
+from policies.skillmimic.config import TASKS, SkillMimic, Task, check_skill
 from policies.skillmimic.env import Env
 from policies.skillmimic.evaluate import ticks_of
 from policies.skillmimic.graph import PolicyGraph
@@ -208,7 +208,7 @@ class Args:
 
 def main() -> None:
     a = tyro.cli(Args, prog="python -m policies.skillmimic.optimise")
-    known_skill(a.task, a.skill)
+    check_skill(a.skill, TASKS[a.task].skills)
     config = TASKS[a.task]
     assert config.corrections is not None  # with a base there is a plan
     torch.set_num_threads(1)

@@ -196,7 +196,8 @@ class Plan(nn.Module):
         planned = self.table[row][:, self.arms :]
         velocity = planned[:, 3:6]
         along = ((ball[:, :3] - planned[:, :3]) * velocity).sum(-1, keepdim=True)
-        along = along / ((velocity * velocity).sum(-1, keepdim=True) + SLOW**2)
+        fast = (velocity * velocity).sum(-1, keepdim=True)
+        along = along / (fast + SLOW**2)
         fallen = (velocity[:, 2:] - ball[:, 5:6]) / GRAVITY
         bounce = skill @ self.bounce
         ahead = torch.where(loop > 0, fallen - bounce * torch.round(fallen / bounce), along)  # s
@@ -207,8 +208,8 @@ class Plan(nn.Module):
         lets_go = (self.away[after] == 0) & (self.away[soon] > 0)
         settles = (clock < 0) & (skill @ self.settle > 0)
         # Somebody still holds the ball that is to bounce.
-        slow, fast = ((v * v).sum(-1, keepdim=True) for v in (ball[:, 3:], velocity))
-        held = (loop > 0) & (clock >= 0) & (clock < 1) & (slow < SLOW**2) & (fast > (4 * SLOW) ** 2)
+        still = (ball[:, 3:] * ball[:, 3:]).sum(-1, keepdim=True) < SLOW**2
+        held = (loop > 0) & (clock >= 0) & (clock < 1) & still & (fast > (4 * SLOW) ** 2)
         rate = torch.where(((lets_go | settles) & ~calm) | held, 0.0, rate)
         moved = clock + rate
         around = moved - (last + 1) * torch.clamp(torch.floor(moved / (last + 1)), min=0.0)

@@ -77,6 +77,12 @@ def _mean_square(error: np.ndarray) -> np.ndarray:
     return np.square(error).reshape(len(error), -1).mean(axis=1)
 
 
+def off(s: Step) -> np.ndarray:
+    """(N, 3) m of the ball from its reference, seen from the bases."""
+    here, there = (m.object_position - m.points[:, 0] for m in (s.state, s.reference))
+    return here - there
+
+
 def body_position(s: Step, k: Sensitivity) -> np.ndarray:
     """r^p, equation 5: key points and base, in the world."""
     return np.exp(-k.body_position * _mean_square(s.state.points - s.reference.points))
@@ -137,8 +143,8 @@ def contact(s: Step, k: Sensitivity) -> np.ndarray:
     return np.exp(-k.contact * np.abs(s.state.contact - s.reference.contact).sum(axis=1))
 
 
-# m, m/s, m, the same, of (action units)^2: errors of a bounced ball that cost 63 %
-BESIDE, STRAIGHT, LOW, HIGH, ROUGH = 0.2, 0.5, 0.2, 0.3, 10.0
+# m, m/s, m, m: errors of a bounced ball that cost 63 %
+BESIDE, STRAIGHT, LOW, HIGH = 0.2, 0.5, 0.2, 0.3
 
 
 def beside(s: Step, k: Sensitivity) -> np.ndarray:
@@ -164,19 +170,13 @@ def lively(s: Step, k: Sensitivity) -> np.ndarray:
 
 def smooth(s: Step, k: Sensitivity) -> np.ndarray:
     """Actions change little."""
-    return np.exp(-_mean_square(s.action_change) / ROUGH)
+    return np.exp(-k.action_rate * _mean_square(s.action_change))
 
 
 def bouncing(terms: np.ndarray) -> np.ndarray:
     """(4, N), in the order of the variant -> (N,): a ball far off still has something to win."""
     place, straight, energy, smooth = terms
     return (0.1 + 0.3 * place + 0.2 * straight + 0.2 * energy + 0.2 * place * energy) * smooth
-
-
-def off(s: Step) -> np.ndarray:
-    """(N, 3) m of the ball from its reference, seen from the bases."""
-    here, there = (m.object_position - m.points[:, 0] for m in (s.state, s.reference))
-    return here - there
 
 
 SubReward = Callable[[Step, Sensitivity], np.ndarray]
@@ -219,9 +219,9 @@ VARIANTS: dict[str, Variant] = {
     "no_cgr": Variant({n: t for n, t in _FULL.items() if n != "contact"}, product, "17"),
     "no_multiplication": Variant(_FULL, mean, "16"),
     "deepmimic": Variant(_DEEPMIMIC, mean, "14"),  # with the sensitivities `deepmimic`
-    # Equation 15 needs a discriminator (amp.py), which the environment asks instead; nothing is paid here.
     # Not the paper's: nothing of the body is imitated, and where the ball goes is what counts.
     "bounces": Variant({"beside": beside, "straight": straight, "lively": lively, "smooth": smooth}, bouncing, ""),
+    # Equation 15 needs a discriminator (amp.py), which the environment asks instead; nothing is paid here.
     "amp": Variant({"none": lambda s, k: np.zeros(len(s.state.joint_pos))}, product, "15"),
 }
 

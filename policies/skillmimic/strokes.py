@@ -5,7 +5,6 @@ In the training environment, as the card measures it, and then with one cause af
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ import tyro
 from policies import ball
 from policies.skillmimic.ablation import tell
 from policies.skillmimic.card import SECONDS, BallActor, graph_in
+from policies.skillmimic.config import check_skill
 from policies.skillmimic.env import BASE, FLIGHT
 from policies.skillmimic.evaluate import episodes_of
 from policies.skillmimic.graph import PolicyGraph
@@ -25,6 +25,7 @@ from policies.skillmimic.plan import GRAVITY
 from policies.skillmimic.randomisation import TABLE
 from policies.skillmimic.starts import first_clips
 from sim2real.options import Count, MaybeNewFile
+from sim2real.simulation import Scene
 
 SHOWN = 5  # bounces
 LOW = 0.3  # m: a ball that turns below bounces
@@ -47,7 +48,7 @@ class Case(NamedTuple):
 
 
 NOT_RANDOM = {n: 0.0 if "noise" in n else (t.low + t.high) / 2 for n, t in TABLE.items()}
-FINE = 0.002  # s, of the deployed worlds
+FINE = Scene.timestep  # s, of the deployed worlds
 CASES = {
     "as in the card": Case(),
     "base held still": Case(still=True),
@@ -139,8 +140,7 @@ def main() -> None:
     a = tyro.cli(Args, prog="python -m policies.skillmimic.strokes")
     torch.set_num_threads(1)
     graph = graph_in(a.policy)
-    if a.skill not in graph.labels:
-        sys.exit(f"skill: got '{a.skill}', expected one of {', '.join(graph.labels)}")
+    check_skill(a.skill, graph.labels)
     found = {}
     for name, case in CASES.items():
         found[name] = watched(a.policy, graph, a.skill, a.robots, case)
