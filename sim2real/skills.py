@@ -16,6 +16,7 @@ import numpy as np
 
 from sim2real.config import RobotConfig
 from sim2real.contract import CARRY, INPUTS, Contract, Object
+from sim2real.limbs import Kinematics
 from sim2real.tracker import ObjectEstimate, ObjectTracker
 from sim2real.types import JointCommand, Mode, OperatorInput, RobotState, Sim2realError
 
@@ -98,6 +99,7 @@ class SkillPlayer:
         self.period = periods.pop()
         self.tracker = tracker or tracker_for([policy.contract for policy in policies])
         seen = self.tracker.current if self.tracker is not None else ObjectEstimate()
+        self._kinematics = Kinematics(config) if self.tracker is not None else None
         self.plans = [_Plan(config, policy.contract, seen) for policy in policies]
         n = len(config.joint_names)
         self.command = JointCommand(-np.inf, np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n))
@@ -145,8 +147,10 @@ class SkillPlayer:
         """One policy tick. Returns the same JointCommand object each time; never raises on a bad state: that is the
         gate's to judge. A policy is never fed what is not finite (a lost sensor, an object nobody has seen): the command is
         then not renewed, it grows old, and the guardian holds and damps."""
-        if self.tracker is not None:
-            self.tracker.estimate(now, state.orientation_base_in_world)
+        if self.tracker is not None and self._kinematics is not None:
+            orientation, turning = state.orientation_base_in_world, state.angular_velocity_base_in_base
+            limbs = self._kinematics(state.joint_pos, state.joint_vel, orientation, turning)
+            self.tracker.estimate(now, orientation, limbs)
         if mode != Mode.RUN and mode != Mode.HOLD:
             self.stage = Stage.STANDBY
         elif self.stage == Stage.STANDBY:

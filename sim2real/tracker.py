@@ -2,16 +2,19 @@
 
 Three hypotheses run side by side and are weighed by how well each foretold the samples (interacting multiple models, Blom
 & Bar-Shalom, IEEE Trans. Automatic Control 33:780, 1988): the object flies, under gravity, and bounces off the floor; or
-it is held, and goes on as it went; or it is moved, and goes on much less surely. Each is a Kalman filter with the same
-noise on all three axes, so that one 2 x 2 covariance serves them.
+it is held, and goes on as it went; or it is moved, and goes on much less surely. Each is a Kalman filter. What flies goes on
+flying while no hand of the robot is near: seen at 60 Hz with millimetres of noise, a flight alone looks for a tenth of a
+second as if something moved the object, and a dribbled ball is half-way up by then.
 
-Axes are those of the IMU's world (z up, yaw arbitrary), the origin is the base, and between two samples the base counts as
-moving uniformly: what a robot can know without an estimate of its own velocity. A sample is placed at the time it was
-taken, with the orientation of that time; the answer is for now.
+Axes are those of the IMU's world (z up, yaw arbitrary), the origin is on the floor: where the object is, the robot's feet
+tell (``limbs``), for a base that sways is no place from which a flight looks like one. Of a robot that does not know its
+feet the base counts as standing still. A sample is placed at the time it was taken, with the orientation and the base of
+that time; the answer is for now.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from dataclasses import dataclass, field
@@ -19,7 +22,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sim2real.limbs import Limbs
+
 GRAVITY = np.array([0.0, 0.0, -9.81])
+# A bounce: s for which the ball is pressed flat on the floor (a basketball: 15 to 20 ms); by how much of its speed it leaves
+# faster or slower than it should; m/s that friction may add sideways.
+PRESSED, UNSURE, RUBS = 0.022, 0.1, 0.1
+PRESS = 0.02  # m, by which it is pressed
+NOBODY = Limbs()
 
 
 class ObjectSample(NamedTuple):
@@ -53,12 +63,12 @@ class Counters:
 
 
 class _Hypothesis:
-    """One Kalman filter: position and velocity (3,), covariance (2, 2) of each axis, and a weight."""
+    """One Kalman filter: position and velocity (3,), covariance (3, 2, 2) of each axis, and a weight."""
 
     def __init__(self, flies: bool, noise: float) -> None:
         self.flies, self.noise = flies, noise  # noise: m^2/s^3, of the acceleration
         self.position, self.velocity = np.zeros(3), np.zeros(3)
-        self.covariance = np.eye(2)
+        self.covariance = np.tile(np.eye(2), (3, 1, 1))
         self.weight = 1.0
 
     def predicted(self, dt: float, floor: float, restitution: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -75,23 +85,26 @@ class _Hypothesis:
                 break
             p += v * fall + GRAVITY * fall**2 / 2
             v += GRAVITY * fall
-            covariance[1, 1] += (0.1 * v[2]) ** 2  # restitution differs from bounce to bounce by that much
+            covariance[2, 1, 1] += (UNSURE * v[2]) ** 2
+            covariance[2, 0, 0] += (UNSURE * PRESSED * v[2]) ** 2
+            covariance[:2, 1, 1] += RUBS**2
             v[2] *= -restitution
             p[2] = floor
             dt -= fall
             if v[2] < 0.05:  # it lies
                 return p + v * [dt, dt, 0], v * [1, 1, 0], covariance
+            p[2] -= PRESSED * v[2]  # from where it would have to come, if it were thrown back at once
         return p + v * dt + GRAVITY * dt**2 / 2, v + GRAVITY * dt, covariance
 
-    def correct(self, measured: np.ndarray, variance: float) -> float:
-        """Take in a position (3,) m. Returns its likelihood before it was known."""
+    def correct(self, measured: np.ndarray, variance: np.ndarray) -> float:
+        """Take in a position (3,) m of ``variance`` (3,). Returns its likelihood before it was known."""
         innovation = measured - self.position
-        s = self.covariance[0, 0] + variance
-        gain = self.covariance[:, 0] / s
-        self.position += gain[0] * innovation
-        self.velocity += gain[1] * innovation
-        self.covariance = self.covariance - np.outer(gain, self.covariance[0])
-        return math.exp(-0.5 * float(innovation @ innovation) / s) / s**1.5
+        s = self.covariance[:, 0, 0] + variance
+        gain = self.covariance[:, :, 0] / s[:, None]
+        self.position += gain[:, 0] * innovation
+        self.velocity += gain[:, 1] * innovation
+        self.covariance = self.covariance - gain[:, :, None] * self.covariance[:, :1]
+        return math.exp(-0.5 * float((innovation * innovation / s).sum())) / math.sqrt(float(s.prod()))
 
 
 class ObjectTracker:
@@ -105,16 +118,18 @@ class ObjectTracker:
     patience = 3  # strange samples in a row, after which the next one is believed
     gap = 0.3  # s without a sample, after which the filter starts anew
     gate = 25.0  # squared distance, in variances, of a strange sample: 5 sigma
-    switching = 4.0  # 1/s: how often something is caught or thrown
+    switching = 2.0  # 1/s: how often something is caught or thrown
+    reach = 0.2  # m between palm and centre of an object: one farther from all palms is seldom taken out of its flight:
+    alone = 0.1  # 1/s: by somebody else
 
-    def __init__(self, radius: float, *, restitution: float = 0.8, noise: float = 0.006, height: float = 0.78) -> None:
+    def __init__(self, radius: float, *, restitution: float = 0.8, noise: float = 0.008, height: float = 0.78) -> None:
         self.radius, self.restitution, self.noise, self.height = radius, restitution, noise, height
         self.counters = Counters()
         self.current = ObjectEstimate()
         # Drag and spin disturb a flight by less than 1 m/s^2, as a swaying robot does a ball it holds; hands that move a
         # ball do so with tens of m/s^2 for tenths of a second.
-        self._hypotheses = [_Hypothesis(True, 0.05), _Hypothesis(False, 0.005), _Hypothesis(False, 3.0)]
-        self._turned: deque[tuple[float, np.ndarray]] = deque()
+        self._hypotheses = [_Hypothesis(True, 0.01), _Hypothesis(False, 0.005), _Hypothesis(False, 30.0)]
+        self._turned: deque[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = deque()
         self._time = -math.inf  # of the newest sample used
         self._strange = 0
 
@@ -123,24 +138,25 @@ class ObjectTracker:
         if not (np.isfinite(sample.position_object_in_base).all() and math.isfinite(sample.time)):
             self.counters.strange += 1
             return False
-        orientation = self._orientation(sample.time)
-        if orientation is None:
+        then = self._then(sample.time)
+        if then is None:
             return False
         if sample.time <= self._time:
             self.counters.late += 1
             return False
         if math.isfinite(sample.height_base_in_world):
             self.height = sample.height_base_in_world
-        position = rotate(orientation, sample.position_object_in_base)
+        orientation, base, palms = then
+        position = base + rotate(orientation, sample.position_object_in_base)
         if sample.time - self._time > self.gap:
             self._restart(position, sample.time)
-        elif not self._advance(position, sample.time):
+        elif not self._advance(position, sample.time, palms):
             return False
         self.counters.used += 1
         return True
 
-    def estimate(self, now: float, orientation_base_in_world: np.ndarray) -> ObjectEstimate:
-        """For ``now`` (s), and remember the orientation (4,) of now. The same object every time.
+    def estimate(self, now: float, orientation_base_in_world: np.ndarray, limbs: Limbs = NOBODY) -> ObjectEstimate:
+        """For ``now`` (s), and remember the orientation (4,) and the limbs of now. The same object every time.
 
         Everything is NaN before the first sample and while the orientation is none (not finite, or the zeros of an IMU
         that has not spoken); old estimates stay, with an ``age`` that tells.
@@ -149,7 +165,9 @@ class ObjectTracker:
         if not 0.9 < orientation_base_in_world @ orientation_base_in_world < 1.1:
             e.position_in_base[:], e.velocity_in_base[:] = np.nan, np.nan
             return e
-        self._turned.append((now, np.array(orientation_base_in_world, float)))
+        base = np.array([0.0, 0.0, self.height]) if limbs.base is None else limbs.base
+        palms = np.array([base + rotate(orientation_base_in_world, palm) for palm in limbs.palms])
+        self._turned.append((now, np.array(orientation_base_in_world, float), base, palms))
         while self._turned[0][0] < now - self.memory:
             self._turned.popleft()
         if self._time == -math.inf:
@@ -159,60 +177,57 @@ class ObjectTracker:
         back = orientation_base_in_world * [1.0, -1.0, -1.0, -1.0]
         position, velocity = np.zeros(3), np.zeros(3)
         for h in self._hypotheses:
-            p, v, _ = h.predicted(ahead, self._floor, self.restitution)
+            p, v, _ = h.predicted(ahead, self.radius, self.restitution)
             position += h.weight * p
             velocity += h.weight * v
-        e.position_in_base[:] = rotate(back, position)
-        e.velocity_in_base[:] = rotate(back, velocity)
+        e.position_in_base[:] = rotate(back, position - base)
+        e.velocity_in_base[:] = rotate(back, velocity - limbs.velocity)
         e.flying = self._hypotheses[0].weight
         return e
 
-    @property
-    def _floor(self) -> float:
-        return self.radius - self.height
-
-    def _orientation(self, time: float) -> np.ndarray | None:
-        """Of the base at ``time``, between the two remembered next to it."""
+    def _then(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Orientation and place of the base, and places of the palms at ``time``, between those remembered next to it."""
         if not self._turned or time < self._turned[0][0]:
             self.counters.stale += 1
             return None
-        newest, q = self._turned[-1]
-        if time >= newest:
-            if time > newest + 0.1:
+        newest = self._turned[-1]
+        if time >= newest[0]:
+            if time > newest[0] + 0.1:
                 self.counters.early += 1
                 return None
-            return q
-        for (t1, q1), (t0, q0) in zip(reversed(self._turned), list(reversed(self._turned))[1:], strict=False):
+            return newest[1:]
+        for (t1, q1, *places1), (t0, q0, *places0) in itertools.pairwise(reversed(self._turned)):
             if t0 <= time:
                 share = (time - t0) / (t1 - t0)
                 mixed = (1 - share) * q0 + share * (q1 if q0 @ q1 >= 0 else -q1)
-                return mixed / np.linalg.norm(mixed)
-        return self._turned[0][1]
+                base, palms = (b + share * (a - b) if a.shape == b.shape else b for a, b in zip(places1, places0, strict=True))
+                return mixed / np.linalg.norm(mixed), base, palms
+        return self._turned[0][1:]
 
     def _restart(self, position: np.ndarray, time: float) -> None:
         for h in self._hypotheses:
             h.position, h.velocity = position.copy(), np.zeros(3)
-            h.covariance = np.diag([self.noise**2, 9.0])  # it may move at 3 m/s
+            h.covariance = np.tile(np.diag([self.noise**2, 9.0]), (3, 1, 1))  # it may move at 3 m/s
             h.weight = 1 / len(self._hypotheses)
         self._time, self._strange = time, 0
         self.counters.restarts += 1
 
-    def _advance(self, position: np.ndarray, time: float) -> bool:
-        dt, variance = time - self._time, self.noise**2
-        now, count = self._hypotheses, len(self._hypotheses)
-        stay = math.exp(-self.switching * dt)
+    def _advance(self, position: np.ndarray, time: float, palms: np.ndarray) -> bool:
+        dt, now = time - self._time, self._hypotheses
+        variance = np.full(3, self.noise**2)
+        if position[2] < self.radius:  # it presses on the floor, and its centre comes closer than a bounce here knows
+            variance[2] += PRESS**2
+        switched = self._switched(dt, palms)
         ahead = []
         for k, h in enumerate(now):
             # Where a hypothesis comes from: itself, or another that switched to it (the mixing step).
-            shares = np.array([w.weight * (stay if j == k else (1 - stay) / (count - 1)) for j, w in enumerate(now)])
+            shares = np.array([w.weight for w in now]) * switched[:, k]
             trial = _Hypothesis(h.flies, h.noise)
             trial.weight = float(shares.sum())
             trial.position, trial.velocity, trial.covariance = _mix(now, shares / trial.weight)
-            trial.position, trial.velocity, trial.covariance = trial.predicted(dt, self._floor, self.restitution)
+            trial.position, trial.velocity, trial.covariance = trial.predicted(dt, self.radius, self.restitution)
             ahead.append(trial)
-        distance = min(
-            float((position - t.position) @ (position - t.position)) / (t.covariance[0, 0] + variance) for t in ahead
-        )
+        distance = min(float(((position - t.position) ** 2 / (t.covariance[:, 0, 0] + variance)).sum()) for t in ahead)
         if distance > self.gate:
             self.counters.strange += 1
             self._strange += 1
@@ -223,19 +238,31 @@ class ObjectTracker:
         likelihoods = [t.weight * t.correct(position, variance) for t in ahead]
         total = sum(likelihoods)
         for t, likelihood in zip(ahead, likelihoods, strict=True):
-            t.weight = likelihood / total if total > 0 else 1 / count
+            t.weight = likelihood / total if total > 0 else 1 / len(now)
         self._hypotheses, self._time, self._strange = ahead, time, 0
         return True
 
+    def _switched(self, dt: float, palms: np.ndarray) -> np.ndarray:
+        """(k, k): chances that each hypothesis has become each other one within ``dt`` s."""
+        count = len(self._hypotheses)
+        rates = np.full((count, count), self.switching / (count - 1))
+        here, _, _ = self._hypotheses[0].predicted(dt, self.radius, self.restitution)
+        if len(palms) and np.linalg.norm(palms - here, axis=1).min() > self.reach:
+            rates[0] = self.alone / (count - 1)
+        np.fill_diagonal(rates, 0.0)
+        total = rates.sum(axis=1, keepdims=True)
+        leaves = 1 - np.exp(-total * dt)
+        return rates / total * leaves + np.diag(1 - leaves[:, 0])
+
 
 def _mix(hypotheses: list[_Hypothesis], shares: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean and covariance (position, velocity, covariance) of a mixture with ``shares`` that sum to 1."""
+    """Mean position, velocity and covariance of a mixture with ``shares`` that sum to 1."""
     position = sum((s * h.position for s, h in zip(shares, hypotheses, strict=True)), np.zeros(3))
     velocity = sum((s * h.velocity for s, h in zip(shares, hypotheses, strict=True)), np.zeros(3))
-    covariance = np.zeros((2, 2))
+    covariance = np.zeros((3, 2, 2))
     for share, h in zip(shares, hypotheses, strict=True):
         off = np.stack([h.position - position, h.velocity - velocity])
-        covariance += share * (h.covariance + off @ off.T / 3)  # the axes share one covariance
+        covariance += share * (h.covariance + off.T[:, :, None] * off.T[:, None])
     return position, velocity, covariance
 
 

@@ -16,8 +16,9 @@ import numpy as np
 
 from drivers.sim.truth import Truth
 from sim2real.contract import Contract, Object, ObjectStart
+from sim2real.limbs import Limbs
 from sim2real.skills import Stage
-from sim2real.tracker import ObjectEstimate, ObjectTracker, rotate
+from sim2real.tracker import NOBODY, ObjectEstimate, ObjectTracker, rotate
 
 GRAVITY = 9.81  # m/s^2
 AWAY = 0.4  # m in front of its place: where a ball waits that will be put into the robot's hands
@@ -126,7 +127,7 @@ class TrueObject(ObjectTracker):
         super().__init__(radius)
         self._world = world
 
-    def estimate(self, now: float, orientation_base_in_world: np.ndarray) -> ObjectEstimate:
+    def estimate(self, now: float, orientation_base_in_world: np.ndarray, limbs: Limbs = NOBODY) -> ObjectEstimate:
         """The truth of now, whatever the robot believes its own orientation to be."""
         truth, e = self._world.truth(), self.current
         back = truth.orientation_base_in_world * [1.0, -1.0, -1.0, -1.0]

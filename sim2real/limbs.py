@@ -1,0 +1,92 @@
+"""Where a robot's palms are and how its base moves over the floor, by its joints, its IMU and its MJCF."""
+
+# MuJoCo ships no types.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sim2real.config import RobotConfig
+
+
+class Limbs(NamedTuple):
+    """Of one instant. Axes of ``base`` and ``velocity`` are those of the IMU's world: z up, yaw arbitrary."""
+
+    palms: np.ndarray = np.zeros((0, 3))  # (k, 3) m in the base; none: nobody knows where they are
+    base: np.ndarray | None = None  # (3,) m: z above the soles, x and y of an origin that drifts; None: nobody knows
+    velocity: np.ndarray = np.zeros(3)  # (3,) m/s of the base
+
+
+class Kinematics:
+    """``kinematics(...)`` every tick -> Limbs: palms and soles are the sites of the robot's MJCF whose names end in ``_palm``
+    and ``_foot``. A robot without such soles says nothing of its base.
+
+    The soles nearest to the floor stand still on it, and the base moves as they say (leg odometry).
+    """
+
+    near = 0.01  # m above the lowest sole, up to which another one stands too
+
+    def __init__(self, robot: RobotConfig) -> None:
+        import mujoco  # here: only robots with an object need it at run time
+
+        self._kinematics = mujoco.mj_kinematics
+        model = self._model = mujoco.MjModel.from_xml_path(str(robot.model_path))
+        self._data = mujoco.MjData(model)
+        sites = {
+            kind: [k for k in range(model.nsite) if model.site(k).name.endswith(kind)] for kind in ("_palm", "_foot")
+        }
+        self._sites, self._feet = sites["_palm"] + sites["_foot"], len(sites["_foot"])
+        self._root = model.body(robot.base).id
+        self._joints = [model.joint(name).qposadr[0] for name in robot.joint_names]
+        self._soles: np.ndarray | None = None  # (feet, 3) m from the base, in the world's axes, a tick ago
+        self._last: np.ndarray | None = None  # that was answered of the base
+        self._place = np.zeros(2)
+
+    def __call__(
+        self, joint_pos: np.ndarray, joint_vel: np.ndarray, orientation: np.ndarray, angular_velocity: np.ndarray
+    ) -> Limbs:
+        """``joint_pos`` and ``joint_vel`` (n,) rad and rad/s, ``orientation`` (4,) of the base in the world,
+        ``angular_velocity`` (3,) rad/s of the base in the base. Of what is not finite nothing follows."""
+        if not self._sites or not all(
+            np.isfinite(x).all() for x in (joint_pos, joint_vel, orientation, angular_velocity)
+        ):
+            self._soles = None
+            return Limbs(base=self._last)
+        points, soon = self._points(joint_pos), self._points(joint_pos + SOON * joint_vel)
+        palms = points[: len(points) - self._feet]
+        if not self._feet:
+            return Limbs(palms)
+        feet = slice(len(palms), None)
+        turn = _matrix(orientation)
+        soles = points[feet] @ turn.T
+        moving = ((soon - points)[feet] / SOON + np.cross(angular_velocity, points[feet])) @ turn.T
+        stand = soles[:, 2] < soles[:, 2].min() + self.near
+        if self._soles is not None:
+            self._place -= (soles - self._soles)[stand, :2].mean(axis=0)
+        self._soles, self._last = soles, np.append(self._place, -soles[:, 2].min())
+        return Limbs(palms, self._last, -moving[stand].mean(axis=0))
+
+    def _points(self, joint_pos: np.ndarray) -> np.ndarray:
+        """(k, 3) m in the base."""
+        data = self._data
+        data.qpos[self._joints] = joint_pos
+        self._kinematics(self._model, data)
+        return (data.site_xpos[self._sites] - data.xpos[self._root]) @ data.xmat[self._root].reshape(3, 3)
+
+
+SOON = 1e-3  # s over which velocities are differences
+
+
+def _matrix(q: np.ndarray) -> np.ndarray:
+    """(3, 3) of a quaternion (4,) of about unit length."""
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
