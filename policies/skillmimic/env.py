@@ -273,13 +273,13 @@ class Env(VecEnv):
 
     def _track(self) -> np.ndarray:
         """(envs, 6) object_position_in_base and object_velocity_in_base as a tracker tells them."""
-        n, rng, drawn = self.num_envs, self.rng, self.random.drawn
-        newest = self.substeps - 1 - np.floor(drawn["object_delay"][:, 0]).astype(int)
-        measured = _ball_in_base(*(self._recorded[f][np.arange(n), newest] for f in ("qpos", "qvel")))
-        measured[:, :3] += drawn["object_offset"] + drawn["object_noise"] * rng.standard_normal((n, 3))
-        measured[:, 3:] += drawn["object_velocity_noise"] * rng.standard_normal((n, 3))
-        held = self.contacts.touching(self._recorded["sensordata"][:, -1])[:, 0]
-        return self.sight.look(measured, drawn["object_loss"][:, 0], held, self._qpos[:, 2], rng)
+        drawn, base = self.random.drawn, np.hstack([self._qpos[:, :3], self._qvel[:, :3]])
+        held = self.contacts.touching(self._recorded["sensordata"][:, -1])[:, 0] | (self._aims > 0)
+        late, loss = drawn["object_delay"][:, 0].astype(int), drawn["object_loss"][:, 0]
+        noise = np.repeat(np.hstack([drawn["object_noise"], drawn["object_velocity_noise"]]), 3, axis=1)
+        seen = self.sight.look(_ball(self._qpos, self._qvel), held, late, loss, noise, self.rng) - base
+        back = conjugate(self._qpos[:, 3:7])
+        return np.hstack([rotate(back, seen[:, :3]) + drawn["object_offset"], rotate(back, seen[:, 3:])])
 
     def _truth(self) -> np.ndarray:
         """(envs, size): what the critic may know beside the actor's observation; about 1 in size."""
@@ -379,7 +379,7 @@ class Env(VecEnv):
             )
             self.command[ids] = _tensor(self.graph.draw(rng, self.clips.skill[self.clip[ids]]))
             self.carries["carry_base_skill"][ids] = self.graph.gait(self.command[ids])
-        self.sight.begin(ids, _ball_in_base(qpos, qvel))
+        self.sight.begin(ids, _ball(qpos, qvel), ~flies[:, 0] | waits)
         before = self.clips.rows(self.clip[ids], np.maximum(self.row[ids] - 1, 0))
         self._last_points[ids] = self.clips.motion(*before).points
         if self.discriminator is not None:
@@ -415,6 +415,11 @@ class Env(VecEnv):
         qvel[:, :3] += shift
         qvel[:, FLIGHT] += shift
         qvel[:, RATES] += w * rng.uniform(-0.2, 0.2, (k, self.model.nu))
+
+
+def _ball(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    """(k, 6) m and m/s of the ball in the world."""
+    return np.hstack([qpos[:, BALL], qvel[:, FLIGHT]])
 
 
 def _ball_in_base(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:

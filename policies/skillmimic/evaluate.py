@@ -210,10 +210,10 @@ def performed(
     everything = Trace(*(np.stack(values) for values in zip(*rows, strict=True)))
     ticks = {clip: ticks_of(graph, clip, seconds) for clip in np.unique(clips)}
     aimed = {clip: ticks_aimed(graph, clip) for clip in ticks}
-    shares = [
-        succeeded(skill, Trace(*(x[:end, n] for x in everything)), config.period, ticks[clips[n]], aimed[clips[n]])
-        for n, end in enumerate(frames)
-    ]
+    shares = []
+    for n, clip in enumerate(clips):
+        trace = Trace(*(x[: min(frames[n], ticks[clip]), n] for x in everything))
+        shares.append(succeeded(skill, trace, config.period, ticks[clip], aimed[clip]))
     return Episodes(np.array(shares), sums, frames)
 
 
@@ -228,10 +228,11 @@ def episodes_of(
 ) -> Env:
     """An environment in which every robot begins an episode of ``skill``: at the beginning of a clip, where its rule needs
     that. ``fixed``: of terms of the randomisation what they are in each episode (episodes,); NaN: drawn, as ever."""
+    clips = np.flatnonzero(graph.clips.skill == graph.labels.index(skill)).tolist()
     config = dataclasses.replace(
         graph.config,
         envs=episodes,
-        frames=round(seconds / graph.config.period),
+        frames=max(ticks_of(graph, clip, seconds) for clip in clips),
         push_speed=push,
         push_chance=graph.config.push_chance if push else 0.0,
         anywhere=skill not in RULES,

@@ -73,13 +73,17 @@ TABLE: dict[str, Term] = {
     "ball_friction": Term(0.6, 1.2, 1, "x 0.8 on the floor, x 1 on palms: sweat, dust, new rubber", _ball_friction),
     # the tracker: what is left after its filter
     "object_offset": Term(-0.01, 0.01, 3, "m: calibration of camera or markers to the base"),
-    "object_noise": Term(0.0, 0.008, 1, "m, standard deviation of the position"),
-    "object_velocity_noise": Term(0.0, 0.2, 1, "m/s, standard deviation: it is differentiated"),
+    "object_noise": Term(0.0, 0.008, 1, "m, standard deviation of the position; it lasts"),
+    "object_velocity_noise": Term(0.0, 0.1, 1, "m/s, standard deviation: it is differentiated"),
     "object_delay": Term(
-        0.0, 3.0, 1, "substeps of 5 ms (whole ones): what prediction leaves; flights are seen up to 10 ms off"
+        2.0,
+        5.0,
+        1,
+        "ticks (whole ones) since the sighting from which it is foretold: 40 ms of camera, and to believe it",
     ),
     "object_loss": Term(0.0, 0.05, 1, "chance a tick that the ball is lost from sight; its course is foretold then"),
 }
+LATEST = 4  # ticks, of object_delay
 LOSS_TICKS = (1, 8)  # how long it stays lost
 
 EXPANDED = ("geom_friction", "body_mass", "body_inertia", "body_ipos", "actuator_gainprm", "actuator_biasprm",

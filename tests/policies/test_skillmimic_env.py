@@ -14,12 +14,13 @@ from policies.skillmimic.config import TASKS, SkillMimic
 from policies.skillmimic.env import BALL, JOINTS, Env
 from policies.skillmimic.evaluate import episodes_of, evaluate, measure
 from policies.skillmimic.graph import PolicyGraph
-from policies.skillmimic.randomisation import TABLE
-from policies.skillmimic.sight import Sight
+from policies.skillmimic.randomisation import LOSS_TICKS, TABLE
+from policies.skillmimic.sight import LASTS, Sight, foretold
 from policies.skillmimic.starts import thrown
 from policies.skillmimic.terminations import TERMINATIONS
 from sim2real.contract import CARRY, INPUTS
 from sim2real.object.scene import AIMING
+from sim2real.tracker import PRESSED
 from sim2real.types import Sim2realError
 
 CONFIG = SkillMimic(envs=8, threads=1, disturbed=0.0, push_chance=0.0)
@@ -173,50 +174,87 @@ def test_the_actor_has_a_robots_senses_only(graph):
 
 
 def test_where_in_the_world_it_is_and_how_fast_the_actor_cannot_tell(env):
-    before, truth = env.observation.clone(), env.privileged.clone()
-    state = env.rng.bit_generator.state
+    env.random.drawn["object_loss"][:] = 0.0
+    state, sight, truth = env.rng.bit_generator.state, copy.deepcopy(env.sight), env.privileged.clone()
     env._observe()  # the same state, with noise of its own
-    env.rng.bit_generator.state = state
-    env._observe()
     before = env.observation.clone()
-    env.rng.bit_generator.state = state
+    env.rng.bit_generator.state, env.sight = state, sight
     for field, moved in (("qpos", 3.0), ("qvel", 0.7)):
         for part in (slice(0, 3), BALL if field == "qpos" else slice(-6, -3)):
             env._recorded[field][..., part] += moved
-    env._qpos[:, :3] += 3.0
-    env._qvel[:, :3] += 0.7
+            (env._qpos if field == "qpos" else env._qvel)[:, part] += moved
+    since = CONFIG.period * np.arange(1, 1 + len(sight._past))[:, None, None]  # it has been going faster for a while
+    sight._past[..., :3] += 3.0 - 0.7 * since
+    sight._past[..., 3:] += 0.7
     env._observe()
     np.testing.assert_allclose(env.observation, before, atol=1e-5)
     assert (env.privileged - truth).abs().max() > 0.5
 
 
-def test_a_held_ball_out_of_sight_goes_on_as_it_went(env):
-    env.random.drawn["object_loss"][:] = 0.0
-    env.step(still(env))
-    env.sight.lost[:] = 2
-    for seen in (False, False, True):
-        before = {name: env.inputs[f"object_{name}_in_base"].clone() for name in ("position", "velocity")}
-        env.step(still(env))
-        told = before["position"] + CONFIG.period * before["velocity"]
-        same = torch.isclose(env.inputs["object_position_in_base"], told, atol=1e-5).all(dim=1)
-        assert not same.any() if seen else same.all()
-        assert seen or torch.equal(env.inputs["object_velocity_in_base"], before["velocity"])
+def look(sight, truth, held=False, late=0, loss=0.0, noise=0.0, seed=0):
+    """One tick of a ``sight`` whose robots are all alike."""
+    n = len(sight.lost)
+    alike = lambda x: np.full(n, x)  # noqa: E731
+    spread = np.full((n, 6), noise)
+    rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
+    return sight.look(np.tile(truth, (n, 1)), alike(held), alike(late), alike(loss), spread, rng)
 
 
-def test_a_free_ball_out_of_sight_falls_and_bounces():
-    """The second one is a centimetre above the floor, and the third in somebody's hands."""
-    dt, height, sight = CONFIG.period, np.array([0.78, 0.7, 0.7]), Sight(3, CONFIG.period)
-    floor = ball.RADIUS - 0.7
-    sight.begin(
-        np.arange(3), np.array([[0.5, 0, -0.3, 1, 0, 0], [0.5, 0, floor + 0.01, 0, 0, -3], [0.4, 0, 0, 0, 0, 1.0]])
-    )
-    sight.lost[:] = 1
-    held = np.array([False, False, True])
-    told = sight.look(np.full((3, 6), 9.0), np.zeros(3), held, height, np.random.default_rng(0))
-    np.testing.assert_allclose(told[0], [0.5 + dt, 0, -0.3 - 9.81 * dt**2 / 2, 1, 0, -9.81 * dt])
-    np.testing.assert_allclose(told[1], [0.5, 0, floor, 0, 0, ball.RESTITUTION * (3 + 9.81 * dt)])
-    np.testing.assert_allclose(told[2], [0.4, 0, dt, 0, 0, 1])
-    assert (sight.look(np.full((3, 6), 9.0), np.zeros(3), held, height, np.random.default_rng(0)) == 9.0).all()
+def dropped(t, floor=ball.RADIUS):
+    """(6,) m and m/s of a ball that flies 1 m/s forwards, 0.4 m over its place on the floor at first, and bounces once."""
+    fall = np.sqrt(2 * 0.4 / 9.81)
+    if t < fall:
+        return np.array([0.3 + t, 0.0, floor + 0.4 - 9.81 * t**2 / 2, 1.0, 0.0, -9.81 * t])
+    off, since = ball.RESTITUTION * 9.81 * fall, t - fall
+    height = floor + off * (since - PRESSED) - 9.81 * since**2 / 2
+    return np.array([0.3 + t, 0.0, height, 1.0, 0.0, off - 9.81 * since])
+
+
+@pytest.mark.parametrize("late", [0, 2, 4])
+def test_a_flight_is_known_for_now_however_late_it_is_seen(late):
+    dt, sight = CONFIG.period, Sight(2, CONFIG.period)
+    sight.begin(np.arange(2), np.tile(dropped(0.0), (2, 1)), np.zeros(2, bool))
+    for k in range(22):
+        told = look(sight, dropped(k * dt), late=late)
+        np.testing.assert_allclose(told, np.tile(dropped(k * dt), (2, 1)), atol=1e-9)
+
+
+def test_a_push_is_known_when_it_is_seen_and_in_a_hand_nothing_falls():
+    sight, still, pushed = Sight(1, CONFIG.period), np.array([0.3, 0, 0, 0, 0, 0.0]), np.array([0.3, 0, 0.1, 0, 0, 2.0])
+    sight.begin(np.arange(1), still[None], np.array([True]))
+    for _ in range(5):
+        np.testing.assert_array_equal(look(sight, still, held=True, late=3)[0], still)
+    for _ in range(3):
+        np.testing.assert_array_equal(look(sight, pushed, held=True, late=3)[0], still)
+    np.testing.assert_allclose(look(sight, pushed, held=True, late=3)[0], pushed + [0, 0, 6 * CONFIG.period, 0, 0, 0])
+
+
+def test_out_of_sight_a_ball_is_foretold_from_where_it_was_seen_last():
+    dt, sight = CONFIG.period, Sight(1, CONFIG.period)
+    sight.begin(np.arange(1), dropped(0.0)[None], np.array([False]))
+    for k in range(6):
+        sight.lost[:] = k > 0
+        told = look(sight, dropped(k * dt) if k == 0 else np.full(6, 9.0), late=0)
+        np.testing.assert_allclose(told[0], dropped(k * dt), atol=1e-9)
+    assert (look(sight, np.full(6, 9.0), held=True) == 9.0).all()  # there it is again
+    sight.begin(np.arange(1), dropped(0.0)[None], np.array([False]))
+    assert look(sight, np.full(6, 9.0), loss=1.0)[0, 0] < 1.0 and 0 <= sight.lost[0] < LOSS_TICKS[1]
+
+
+def test_a_ball_that_lies_goes_on_lying():
+    floor = ball.RADIUS
+    seen = np.array([[0.5, 0, floor, 0, 0, 0], [0.5, 0, floor + 0.003, 0, 0, 0], [0.5, 0, floor - 0.003, 0, 0, 0.0]])
+    told = foretold(seen, np.full(3, 0.15), np.ones(3, bool))
+    assert np.abs(told[:, 2] - floor).max() < 0.006 and np.abs(told[:, 5]).max() < 0.2
+
+
+def test_what_a_tracker_is_off_by_lasts_a_few_ticks():
+    sight, rng, nowhere = Sight(4000, CONFIG.period), np.random.default_rng(0), np.zeros(6)
+    sight.begin(np.arange(4000), np.zeros((4000, 6)), np.ones(4000, bool))
+    told = np.array([look(sight, nowhere, held=True, noise=0.2, seed=rng) for _ in range(12)])
+    assert told[-1].std(axis=0) == pytest.approx([0.2] * 6, rel=0.05)
+    lasting = (told[-1] * told[-2]).mean(axis=0) / 0.2**2
+    assert lasting == pytest.approx([LASTS] * 6, abs=0.07)
 
 
 def test_a_ball_lost_from_the_first_tick_is_not_where_the_last_episodes_was(env):

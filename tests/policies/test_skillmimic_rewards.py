@@ -118,8 +118,7 @@ def test_the_released_code_forgives_the_ball():
 @pytest.mark.parametrize(
     ("changed", "value", "term", "expected"),
     [
-        ("object_position", [0.1, 0.0, 0.0], "beside", np.exp(-((0.1 / 0.2) ** 2))),
-        ("object_velocity", [0.0, 0.5, 0.0], "straight", np.exp(-1)),
+        ("object_position", [0.1, 0.0, 0.0], "returns", np.exp(-((0.1 / 0.2) ** 2))),
         ("object_position", [0.0, 0.0, -0.2], "lively", np.exp(-1)),  # as a height: too low costs more than too high
         ("object_position", [0.0, 0.0, 0.3], "lively", np.exp(-1)),
         ("object_velocity", [0.0, 0.0, 2.0], "lively", np.exp(-((4 / 2 / 9.81 / 0.3) ** 2))),
@@ -142,5 +141,29 @@ def test_the_energy_of_a_ball_in_the_hand_is_nobodys_business(whose):
 def test_what_a_bounced_ball_is_worth():
     s = step(motion(object_position=np.tile([0.2, 0.0, 0.0], (N, 1))), action_change=np.full((N, A), 1.0))
     near = np.exp(-1)
-    expected = (0.1 + 0.3 * near + 0.2 + 0.2 + 0.2 * near) * np.exp(-0.1)
+    expected = (0.1 + 0.4 * near + 0.2 + 0.3 * near) * np.exp(-0.1)
     assert reward(s, "bounces", ROBOT)[0][0] == pytest.approx(expected)
+
+
+FLOOR, DROP = 0.09, np.sqrt(2 * 9.81 * 0.4)  # m of a ball that lies; m/s after 0.4 m
+
+
+@pytest.mark.parametrize(
+    ("height", "upwards", "seconds"),
+    [
+        (0.7499999, 1.0, 0.0),  # that high it is met, now
+        (0.75 - 0.1962, 2.4525, 0.1),  # it slows down to 1.4715 m/s on its way
+        (0.75 - 0.3, 1.962, 0.2),  # not so high: to its peak
+        (FLOOR + 0.4, 0.0, DROP / 9.81 + 0.8 * DROP / 9.81),  # down, and up to its peak
+        (FLOOR, -5.0, (4.0 - np.sqrt(16.0 - 2 * 9.81 * 0.66)) / 9.81),  # it bounces now, with 0.8 of its speed
+        (1.0, 2.0, None),  # above, and on its way there and back
+    ],
+)
+def test_where_a_bounced_ball_comes_up_counts(height, upwards, seconds):
+    position, velocity = np.tile([0.1, 0.0, height], (N, 1)), np.tile([-0.5, 0.3, upwards], (N, 1))
+    there = step(motion(object_position=position, object_velocity=velocity))
+    if seconds is None:
+        hits = np.sqrt(4.0 + 2 * 9.81 * 0.91)
+        seconds = (2.0 + hits) / 9.81 + (0.8 * hits - np.sqrt((0.8 * hits) ** 2 - 2 * 9.81 * 0.66)) / 9.81
+    off = np.hypot(0.1 - 0.5 * seconds, 0.3 * seconds)
+    assert terms_of(there, ROBOT, "bounces")["returns"] == pytest.approx(np.exp(-((off / 0.2) ** 2)))
