@@ -26,6 +26,7 @@ from sim2real.channel import run_directory
 from sim2real.clock import MonotonicClock, Schedule
 from sim2real.config import RobotConfig
 from sim2real.guardian import operator_layout
+from sim2real.object.camera import Sight
 from sim2real.object.packet import ADDRESS, listen
 from sim2real.object.scene import Handover, starts_of
 from sim2real.operators import Operator, store
@@ -113,6 +114,7 @@ class Launch:
     recorder: Any = None  # a started sim2real.recorder.process.Recorder
     show: Callable[[Launch], None] = lambda launch: None
     hang: bool = False  # nobody sets the simulated robot down from its gantry
+    sight: Sight = "camera"  # what sees the object of a simulation
     sightings: tuple[str, int] = ADDRESS  # of hardware: the UDP address at which the object's sightings are awaited
     messages: list[str] = field(default_factory=list)
     timeout: float = 10.0  # s to be armed and through the soft start, counted from the wish to arm
@@ -137,6 +139,7 @@ class Launch:
             recorder=inherit,
             sightings=self._sightings.fileno() if self._sightings else -1,
             camera=self._sightings.getsockname() if self._sightings and self.simulated else None,
+            sight=self.sight,
             object=thing,
             seed=self.seed,
             faults=list(self.faults),

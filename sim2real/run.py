@@ -22,6 +22,7 @@ from sim2real.channel import Channel
 from sim2real.clock import MonotonicClock, Schedule, tune
 from sim2real.config import RobotConfig, Strict, Wiring, load_robot
 from sim2real.contract import Object
+from sim2real.object.camera import Sight
 from sim2real.recorder.process import Sink
 from sim2real.records import Layout
 
@@ -43,6 +44,7 @@ class RunSpec(Strict):
         -1
     )  # file descriptor of the UDP socket on which the object's sightings come; -1: there is no object
     camera: tuple[str, int] | None = None  # where the simulated camera sends its own
+    sight: Sight = "camera"  # what that is
     object: Object | None = None  # what the simulated world has besides the robot
     seed: int = 0
     faults: list[str] = []

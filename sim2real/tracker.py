@@ -200,7 +200,9 @@ class ObjectTracker:
             if t0 <= time:
                 share = (time - t0) / (t1 - t0)
                 mixed = (1 - share) * q0 + share * (q1 if q0 @ q1 >= 0 else -q1)
-                base, palms = (b + share * (a - b) if a.shape == b.shape else b for a, b in zip(places1, places0, strict=True))
+                base, palms = (
+                    b + share * (a - b) if a.shape == b.shape else b for a, b in zip(places1, places0, strict=True)
+                )
                 return mixed / np.linalg.norm(mixed), base, palms
         return self._turned[0][1:]
 

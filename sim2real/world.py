@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from sim2real.clock import MonotonicClock, tune
-from sim2real.object.camera import SimCamera
+from sim2real.object.camera import SIGHTS, SimCamera
 from sim2real.object.scene import prepare_for
 from sim2real.run import Life, RunSpec, tell
 
@@ -39,7 +39,7 @@ def main(directory: Path) -> int:
     world.advance(SETTLE)
     if spec.tune:  # real motors do not wait for other programs either
         tune(PRIORITY, spin=0.0)
-    camera = SimCamera(seed=spec.seed) if spec.camera else None
+    camera = SimCamera(SIGHTS[spec.sight], spec.seed) if spec.camera else None
     wire = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     wire.setblocking(False)
     said = False

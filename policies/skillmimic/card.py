@@ -20,7 +20,7 @@ from policies.skillmimic.release import graph_of, network_in
 from policies.skillmimic.tables import CELLS, FIRST, NOMINAL, REST, SECOND, pairs, sweep, switched
 from policies.skillmimic.through_bytes import BEFORE, graph_in, judged
 from sim2real.contract import Contract
-from sim2real.object.camera import CameraModel
+from sim2real.object.camera import SIGHTS, Sight
 from sim2real.object.scene import AIMING
 from sim2real.policy import load_policy
 
@@ -30,8 +30,12 @@ TARGETS = {"hold": 0.95, "raise": 0.95, "carry": 0.95, "pass": 0.85, "shot": 0.8
 FILES = 50  # robots of an environment that have a policy file each
 CELL = 25  # episodes of a cell of the tables, at most
 GAP = 0.05  # of success, the most that may be lost from training's world to the bytes with a camera
-WAYS = ("training", "truth", "camera")
-WAY_NAMES = {"training": "training environment", "truth": "bytes, ball known", "camera": "bytes, ball seen"}
+WAYS = {
+    "training": "training environment",
+    "truth": "bytes, ball known",
+    "camera": "bytes, ball seen",
+    "capture": "bytes, by motion capture",
+}
 
 
 class Evaluation(NamedTuple):
@@ -79,9 +83,12 @@ class BallActor(FileActor):
         self.policies[k].reset({name: carry[k].numpy() for name, carry in env.carries.items()})
 
 
-def evaluate(path: Path, episodes: int, deployed: int, parts: Parts, tables: bool = False) -> Evaluation:
+def evaluate(
+    path: Path, episodes: int, deployed: int, parts: Parts, tables: bool = False, capture: bool = False
+) -> Evaluation:
     """Measure a policy file: ``episodes`` per skill in training's world, ``deployed`` per skill and way through the bytes;
-    with ``tables``, a fifth of ``episodes``, at most ``CELL``, per cell of the paper's Tables 2 and 3.
+    with ``capture``, seen by motion capture too; with ``tables``, a fifth of ``episodes``, at most ``CELL``, per cell of the
+    paper's Tables 2 and 3.
 
     Raises Sim2realError if the file is refused or was made with other settings.
     """
@@ -94,8 +101,10 @@ def evaluate(path: Path, episodes: int, deployed: int, parts: Parts, tables: boo
     results = {
         "training": dict(zip(graph.labels, trained, strict=True)),
         "truth": through_bytes(path, graph, deployed, None, parts),
-        "camera": through_bytes(path, graph, deployed, CameraModel(), parts),
+        "camera": through_bytes(path, graph, deployed, "camera", parts),
     }
+    if capture:
+        results["capture"] = through_bytes(path, graph, deployed, "capture", parts)
     if not tables:
         return Evaluation(policy.sha256, results)
     each = max(1, min(CELL, episodes // 5))
@@ -128,14 +137,15 @@ def one_after_another(path: Path, first: str, second: str, each: int) -> Array:
 
 
 def through_bytes(
-    path: Path, graph: PolicyGraph, episodes: int, camera: CameraModel | None, parts: Parts
+    path: Path, graph: PolicyGraph, episodes: int, sight: Sight | None, parts: Parts
 ) -> dict[str, Result]:
-    """``episodes`` of every skill in the deployed loop, its clips in turn. ``camera`` None: the ball is known."""
+    """``episodes`` of every skill in the deployed loop, its clips in turn. ``sight`` None: the ball is known."""
     results = {}
     for k, label in enumerate(graph.labels):
         clips = np.flatnonzero(graph.clips.skill == k)
-        each = [(path, int(clips[i % len(clips)]), SECONDS, camera, i) for i in range(episodes)]
-        text = f"{label}: {episodes} runs through the bytes, the ball {'seen by a camera' if camera else 'known'}"
+        model = SIGHTS[sight] if sight else None
+        each = [(path, int(clips[i % len(clips)]), SECONDS, model, i) for i in range(episodes)]
+        text = f"{label}: {episodes} runs through the bytes, the ball {f'seen by {sight}' if sight else 'known'}"
         runs = parts.each(text, judged, each)
         good, sums, frames = (np.array(column) for column in zip(*runs, strict=True))
         results[label] = Episodes(good, sums, np.maximum(frames, 1)).result()
@@ -148,10 +158,10 @@ def card(
     """The policy's card, Markdown. ``pictures``: links to one of each skill, and to that of the "curve"."""
     training, pictures = contract.provenance.training, pictures or {}
     rows = "\n".join(
-        f"| `{label}` | {WAY_NAMES[way]} | {r.success} | {r.accuracy:.3f} | {r.body_error:.3f} | {r.ball_error:.3f} |"
+        f"| `{label}` | {WAYS[way]} | {r.success} | {r.accuracy:.3f} | {r.body_error:.3f} | {r.ball_error:.3f} |"
         f" {r.contact_error:.3f} |"
         for label in contract.skill_labels
-        for way in WAYS
+        for way in e.results
         for r in (e.results[way][label],)
     )
     verdicts = "\n".join(
@@ -262,6 +272,7 @@ def eval_command(
     tables: bool = False,
     runs: Sequence[Path] = (),
     videos: Path | None = None,
+    capture: bool = False,
 ) -> bool:
     """Measure, print, write. Returns whether every skill meets its target, and keeps it on its way through the bytes."""
     from rich.console import Console
@@ -278,11 +289,11 @@ def eval_command(
         for label in contract.skill_labels:
             Parts(console).say(f"{label}: a film")
             gif = videos / f"{label}.gif"
-            shown = film(file, graph, label, gif)
+            shown = film(file, graph, label, gif, "capture" if capture else "camera")
             console.print(f"{gif}: {f'run {shown}, the first good one' if shown else 'no good run among those tried'}")
             pictures[label] = _link(gif, card_file)
-    with kept(console, file.stem, policy.sha256, episodes, deployed, tables) as parts:
-        e = evaluate(file, episodes, deployed, parts, tables)
+    with kept(console, file.stem, policy.sha256, episodes, deployed, tables, capture) as parts:
+        e = evaluate(file, episodes, deployed, parts, tables, capture)
     show(console, contract, e)
     if report:
         report.write_text(json.dumps(e.as_dict(), indent=1) + "\n")
@@ -302,10 +313,10 @@ def show(console: Any, contract: Contract, e: Evaluation) -> None:
     for column in ("skill", "where", "success", "Acc.", "E_b m", "E_o m", "E_cg"):
         table.add_column(column)
     for label in contract.skill_labels:
-        for way in WAYS:
+        for way in e.results:
             r = e.results[way][label]
             numbers = (f"{v:.3f}" for v in (r.accuracy, r.body_error, r.ball_error, r.contact_error))
-            table.add_row(label, WAY_NAMES[way], str(r.success), *numbers)
+            table.add_row(label, WAYS[way], str(r.success), *numbers)
     console.print(table)
     for text in (table_2(e), table_3(e)):
         console.print(text, markup=False, highlight=False, soft_wrap=True)

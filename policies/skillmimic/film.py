@@ -11,7 +11,7 @@ from drivers.sim.camera import Camera
 from policies.skillmimic.evaluate import ticks_of
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.through_bytes import before, deploy_episode
-from sim2real.object.camera import CameraModel
+from sim2real.object.camera import SIGHTS, Sight
 from sim2real.simulation import Simulation
 
 TRIES = 5  # runs, of which the first good one is shown, else the last
@@ -21,8 +21,8 @@ LEAD = 0.6  # s shown of the skill before it
 SIZE, RATE = (300, 260), 12.5  # pixels, Hz: a few hundred kB
 
 
-def film(path: Path, graph: PolicyGraph, label: str, gif: Path) -> int:
-    """Write ``gif`` of a skill of a policy file, robot and ball drawn at random and the ball seen by a camera. Returns which
+def film(path: Path, graph: PolicyGraph, label: str, gif: Path, sight: Sight) -> int:
+    """Write ``gif`` of a skill of a policy file, robot and ball drawn at random and the ball seen by ``sight``. Returns which
     run it shows, from 1; 0: none was good, it shows the last."""
     clips = np.flatnonzero(graph.clips.skill == graph.labels.index(label))
     skill = before(graph, int(clips[0]))  # s: when it begins
@@ -31,7 +31,7 @@ def film(path: Path, graph: PolicyGraph, label: str, gif: Path) -> int:
 
     def run(seed: int, watch: Callable[[Simulation], None] = lambda simulation: None) -> bool:
         clip = int(clips[seed % len(clips)])
-        return deploy_episode(path, graph, clip, seconds, CameraModel(), seed, watch).success >= GOOD
+        return deploy_episode(path, graph, clip, seconds, SIGHTS[sight], seed, watch).success >= GOOD
 
     good = next((seed for seed in range(TRIES) if run(seed)), -1)
     gif.parent.mkdir(parents=True, exist_ok=True)

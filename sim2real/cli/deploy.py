@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 
 from sim2real.config import RobotConfig, load_robot
+from sim2real.object.camera import SIGHTS, Sight
 from sim2real.operators.script import ScriptOperator, Step, parse_script
 from sim2real.options import MaybeNewFile, MaybeNewGif, NotNegative, Seed, Velocity
 from sim2real.types import Sim2realError
@@ -67,6 +68,8 @@ class Args:
     """with --video: an MJCF to show instead, such as the maker's with its meshes (joints matched by name)"""
     sightings: str = ""
     """with --hardware: UDP address at which sightings of the object are awaited, HOST:PORT; default 127.0.0.1:47201"""
+    sight: Sight = "camera"
+    """in simulation: what sees the object of ball skills, a camera on the robot or motion capture"""
     untuned: bool = False
     """do not ask the kernel for real-time scheduling"""
     hardware: bool = False
@@ -113,6 +116,8 @@ def _check(args: Args, config: RobotConfig) -> None:
         raise Sim2realError("--calibration without --hardware: simulated motors are where the YAML says; drop it")
     if args.sightings and not args.hardware:
         raise Sim2realError("--sightings without --hardware: a simulated robot has its own camera; drop it")
+    if args.sight != "camera" and args.hardware:
+        raise Sim2realError("--sight with --hardware: what sees the object there sends to --sightings; drop it")
     _address(args.sightings)
     if args.visuals and not args.video:
         raise Sim2realError("--visuals without --video: nothing would be shown; add --video FILE.gif")
@@ -268,7 +273,7 @@ def _lockstep(args, config, player, policies, operator, record, console):
         config,
         policies,
         operator,
-        Scene(seed=args.seed, faults=args.fault, hang=args.hang),
+        Scene(seed=args.seed, faults=args.fault, hang=args.hang, camera=SIGHTS[args.sight]),
         args.wiring,
         sink_for if record else None,
         (lambda run: camera.see(run.world.plant)) if camera else None,
@@ -313,6 +318,7 @@ def _realtime(args, config, player, policies, operator, record, console):
                 seed=args.seed,
                 faults=args.fault,
                 recorder=recorder,
+                sight=args.sight,
                 sightings=_address(args.sightings),
                 show=status.show,
                 hang=args.hang,

@@ -32,6 +32,8 @@ class Args:
     """write the policy's card to this Markdown file"""
     tables: bool = False
     """of ball skills: other balls and every switch too (the paper's Tables 2 and 3)"""
+    capture: bool = False
+    """of ball skills: through the bytes seen by motion capture too, and filmed so"""
     runs: tyro.conf.UseAppendAction[list[Path]] = field(default_factory=list)
     """of ball skills: the training runs that led to the file, in their order; what they learned when is in the card"""
     videos: MaybeNewFolder = None

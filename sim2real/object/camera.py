@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -24,6 +24,15 @@ class CameraModel:
     jitter: float = 0.01  # s more, uniform
     noise: float = 0.006  # m, standard deviation on each axis
     loss: float = 0.05  # share of exposures without an answer
+
+
+# What sees the object in a simulation: a camera on the robot's head, or motion capture (markers on ball and robot; slower and
+# less exact than such systems' makers say, for the network and the markers between).
+SIGHTS = {
+    "camera": CameraModel(),
+    "capture": CameraModel(rate=240.0, latency=0.008, jitter=0.002, noise=0.001, loss=0.001),
+}
+Sight = Literal["camera", "capture"]  # the keys of SIGHTS
 
 
 class SimCamera:

@@ -40,7 +40,7 @@ def test_the_card_is_about_this_file():
     assert set(report["calm"]) == set(MOTIONS) and len(report["switches"]) == len(MOTIONS) * (len(MOTIONS) - 1)
 
 
-@pytest.mark.parametrize("name", ["ball", "pickup"])
+@pytest.mark.parametrize("name", ["ball", "dribble", "pickup"])
 def test_the_cards_of_ball_skills_are_about_their_files(name):
     file = FILE.with_name(f"{name}.onnx")
     policy, report = load_policy(file, trial=0), json.loads(file.with_suffix(".json").read_text())

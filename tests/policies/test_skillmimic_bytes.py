@@ -100,7 +100,7 @@ def test_a_film_shows_the_first_good_run(graph, file, tmp_path, monkeypatch):
     monkeypatch.setattr(film, "SIZE", (64, 64))
     gif = tmp_path / "films" / "hold.gif"
     try:
-        assert film.film(file, graph, "hold", gif) == 1
+        assert film.film(file, graph, "hold", gif, "camera") == 1
     except BusError as error:
         if "MUJOCO_GL" in str(error):
             pytest.skip(str(error))

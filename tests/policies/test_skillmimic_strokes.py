@@ -71,7 +71,7 @@ def test_the_shipped_dribble_is_told_bounce_by_bounce(tmp_path, monkeypatch, cap
     monkeypatch.setattr(
         strokes, "CASES", {n: strokes.CASES[n] for n in ("base held still", "nothing random, finer steps")}
     )
-    report = tmp_path / "dribble.md"
+    report = tmp_path / "strokes.md"
     words = ["strokes", str(ROOT / "policies/g1/ball.onnx"), "--robots", "2", "--report", str(report)]
     monkeypatch.setattr(sys, "argv", words)
     strokes.main()

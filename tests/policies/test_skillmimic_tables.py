@@ -185,7 +185,9 @@ def test_the_card_says_what_a_success_is_and_which_target_is_met(tmp_path):
     assert "Target 95% through the bytes with a camera, and at most 5 points lost on the way there: met (+2.0" in text
     assert "**missed** (+6.0 points)" in text
     assert "95.0% (88.8% to 97.8%, 100 episodes)" in text
-    assert "Table" not in text and "What it took" not in text
+    assert "Table" not in text and "What it took" not in text and "capture" not in text
+    captured = Evaluation("abc", {**e.results, "capture": results(94, 80)})
+    assert "| `hold` | bytes, by motion capture | 94.0%" in card(contract(), captured)
 
 
 def test_the_card_has_tables_curve_and_films_if_they_were_made(tmp_path):

@@ -59,6 +59,10 @@ WRONG = {
     "no skills": (["--robot", "t1"], "give a policy with --policy FILE.onnx"),
     "skills and policy": (["--robot", "g1", "--skills", "basics", "--policy", "POLICY"], "expected one"),
     "sightings": (["--robot", "g1", "--sightings", "0.0.0.0:1"], "its own camera"),
+    "a sight": (
+        ["--robot", "g1", "--hardware", "--operator", "keyboard", "--sight", "capture"],
+        "sends to --sightings",
+    ),
     "no address": (["--robot", "g1", "--hardware", "--operator", "keyboard", "--sightings", "x"], "expected HOST:PORT"),
     "velocity of nothing": (["--robot", "g1", "--policy", "POLICY", "--velocity", "1", "0", "0"], "add --skill"),
     "lockstep hardware": (["--robot", "g1", "--hardware", "--clock", "lockstep"], "real time"),
