@@ -232,7 +232,7 @@ def episodes_of(
     config = dataclasses.replace(
         graph.config,
         envs=episodes,
-        frames=max(ticks_of(graph, clip, seconds) for clip in clips),
+        frames=round(seconds / graph.config.period) + max(ticks_aimed(graph, clip) for clip in clips),
         push_speed=push,
         push_chance=graph.config.push_chance if push else 0.0,
         anywhere=skill not in RULES,
