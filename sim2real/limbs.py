@@ -49,10 +49,10 @@ class Kinematics:
         self, joint_pos: np.ndarray, joint_vel: np.ndarray, orientation: np.ndarray, angular_velocity: np.ndarray
     ) -> Limbs:
         """``joint_pos`` and ``joint_vel`` (n,) rad and rad/s, ``orientation`` (4,) of the base in the world,
-        ``angular_velocity`` (3,) rad/s of the base in the base. Of what is not finite nothing follows."""
-        if not self._sites or not all(
-            np.isfinite(x).all() for x in (joint_pos, joint_vel, orientation, angular_velocity)
-        ):
+        ``angular_velocity`` (3,) rad/s of the base in the base. Of what is not finite, and of the zeros of an IMU that has not
+        spoken, nothing follows."""
+        told = all(np.isfinite(x).all() for x in (joint_pos, joint_vel, orientation, angular_velocity))
+        if not (self._sites and told and 0.9 < orientation @ orientation < 1.1):
             self._soles = None
             return Limbs(base=self._last)
         points, soon = self._points(joint_pos), self._points(joint_pos + SOON * joint_vel)

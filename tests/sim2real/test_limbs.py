@@ -71,8 +71,14 @@ def test_what_is_not_finite_moves_nothing():
     kinematics, rest = Kinematics(robot), (np.zeros(3),)
     q, base, quaternion, *_ = standing(robot, 0.1)
     assert kinematics(q * np.nan, 0 * q, quaternion, *rest).base is None
+    assert kinematics(q, 0 * q, 0 * quaternion, *rest).base is None
     known = kinematics(q, 0 * q, quaternion, *rest)
-    for bad in ((q * np.nan, 0 * q, quaternion), (q, q + np.inf, quaternion), (q, 0 * q, quaternion * np.nan)):
+    for bad in (
+        (q * np.nan, 0 * q, quaternion),
+        (q, q + np.inf, quaternion),
+        (q, 0 * q, quaternion * np.nan),
+        (q, 0 * q, 0 * quaternion),
+    ):
         lost = kinematics(*bad, *rest)
         np.testing.assert_array_equal(lost.base, known.base)
         assert not len(lost.palms) and not lost.velocity.any()
