@@ -23,7 +23,7 @@ ONLY_IN = {
     "torch": (),
     "onnxruntime": ("sim2real/policy.py",),
     "onnx": ("sim2real/policy.py", "sim2real/graph.py"),
-    "mujoco": ("drivers/sim/plant.py", "drivers/sim/ball.py", "drivers/sim/camera.py"),
+    "mujoco": ("drivers/sim/plant.py", "drivers/sim/ball.py", "drivers/sim/camera.py", "sim2real/limbs.py"),
     "can": ("drivers/can_wire.py", "drivers/open.py", "drivers/sim/*.py"),
     "serial": ("drivers/serial_wire.py",),
     "cyclonedds": ("drivers/dds_wire.py",),
