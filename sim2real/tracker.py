@@ -25,8 +25,8 @@ import numpy as np
 from sim2real.limbs import Limbs
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
-# A bounce: s for which the ball is pressed flat on the floor (a basketball: 15 to 20 ms); by how much of its speed it leaves
-# faster or slower than it should; m/s that friction may add sideways.
+# A bounce: s for which the ball is pressed flat on the floor (as the simulated one is: drivers/sim/ball.py); by how much of
+# its speed it leaves faster or slower than it should; m/s that friction may add sideways.
 PRESSED, UNSURE, RUBS = 0.022, 0.1, 0.1
 PRESS = 0.02  # m, by which it is pressed
 NOBODY = Limbs()
