@@ -11,6 +11,8 @@ import numpy as np
 
 from sim2real.config import RobotConfig
 
+SOON = 1e-3  # s over which velocities are differences
+
 
 class Limbs(NamedTuple):
     """Of one instant. Axes of ``base`` and ``velocity`` are those of the IMU's world: z up, yaw arbitrary."""
@@ -38,7 +40,7 @@ class Kinematics:
         sites = {
             kind: [k for k in range(model.nsite) if model.site(k).name.endswith(kind)] for kind in ("_palm", "_foot")
         }
-        self._sites, self._feet = sites["_palm"] + sites["_foot"], len(sites["_foot"])
+        self._sites, self._palms = sites["_palm"] + sites["_foot"], len(sites["_palm"])
         self._root = model.body(robot.base).id
         self._joints = [model.joint(name).qposadr[0] for name in robot.joint_names]
         self._soles: np.ndarray | None = None  # (feet, 3) m from the base, in the world's axes, a tick ago
@@ -55,29 +57,26 @@ class Kinematics:
         if not (self._sites and told and 0.9 < orientation @ orientation < 1.1):
             self._soles = None
             return Limbs(base=self._last)
-        points, soon = self._points(joint_pos), self._points(joint_pos + SOON * joint_vel)
-        palms = points[: len(points) - self._feet]
-        if not self._feet:
+        palms, feet = self._points(joint_pos)
+        if not len(feet):
             return Limbs(palms)
-        feet = slice(len(palms), None)
+        _, soon = self._points(joint_pos + SOON * joint_vel)
         turn = _matrix(orientation)
-        soles = points[feet] @ turn.T
-        moving = ((soon - points)[feet] / SOON + np.cross(angular_velocity, points[feet])) @ turn.T
+        soles = feet @ turn.T
+        moving = ((soon - feet) / SOON + np.cross(angular_velocity, feet)) @ turn.T
         stand = soles[:, 2] < soles[:, 2].min() + self.near
         if self._soles is not None:
             self._place -= (soles - self._soles)[stand, :2].mean(axis=0)
         self._soles, self._last = soles, np.append(self._place, -soles[:, 2].min())
         return Limbs(palms, self._last, -moving[stand].mean(axis=0))
 
-    def _points(self, joint_pos: np.ndarray) -> np.ndarray:
-        """(k, 3) m in the base."""
+    def _points(self, joint_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Palms (k, 3) and soles (feet, 3), m in the base."""
         data = self._data
         data.qpos[self._joints] = joint_pos
         self._kinematics(self._model, data)
-        return (data.site_xpos[self._sites] - data.xpos[self._root]) @ data.xmat[self._root].reshape(3, 3)
-
-
-SOON = 1e-3  # s over which velocities are differences
+        points = (data.site_xpos[self._sites] - data.xpos[self._root]) @ data.xmat[self._root].reshape(3, 3)
+        return points[: self._palms], points[self._palms :]
 
 
 def _matrix(q: np.ndarray) -> np.ndarray:

@@ -140,10 +140,9 @@ def through_bytes(
     path: Path, graph: PolicyGraph, episodes: int, sight: Sight | None, parts: Parts
 ) -> dict[str, Result]:
     """``episodes`` of every skill in the deployed loop, its clips in turn. ``sight`` None: the ball is known."""
-    results = {}
+    results, model = {}, SIGHTS[sight] if sight else None
     for k, label in enumerate(graph.labels):
         clips = np.flatnonzero(graph.clips.skill == k)
-        model = SIGHTS[sight] if sight else None
         each = [(path, int(clips[i % len(clips)]), SECONDS, model, i) for i in range(episodes)]
         text = f"{label}: {episodes} runs through the bytes, the ball {f'seen by {sight}' if sight else 'known'}"
         runs = parts.each(text, judged, each)

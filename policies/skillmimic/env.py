@@ -273,13 +273,12 @@ class Env(VecEnv):
 
     def _track(self) -> np.ndarray:
         """(envs, 6) object_position_in_base and object_velocity_in_base as a tracker tells them."""
-        drawn, base = self.random.drawn, np.hstack([self._qpos[:, :3], self._qvel[:, :3]])
+        drawn = self.random.drawn
         held = self.contacts.touching(self._recorded["sensordata"][:, -1])[:, 0] | (self._aims > 0)
         late, loss = drawn["object_delay"][:, 0].astype(int), drawn["object_loss"][:, 0]
         noise = np.repeat(np.hstack([drawn["object_noise"], drawn["object_velocity_noise"]]), 3, axis=1)
-        seen = self.sight.look(_ball(self._qpos, self._qvel), held, late, loss, noise, self.rng) - base
-        back = conjugate(self._qpos[:, 3:7])
-        return np.hstack([rotate(back, seen[:, :3]) + drawn["object_offset"], rotate(back, seen[:, 3:])])
+        seen = self.sight.look(_ball(self._qpos, self._qvel), held, late, loss, noise, self.rng)
+        return _in_base(seen, self._qpos, self._qvel) + np.pad(drawn["object_offset"], ((0, 0), (0, 3)))
 
     def _truth(self) -> np.ndarray:
         """(envs, size): what the critic may know beside the actor's observation; about 1 in size."""
@@ -288,7 +287,7 @@ class Env(VecEnv):
         reference = self.clips.motion(rows, way)
         back = conjugate(qpos[:, 3:7])
         turn = multiply(back, reference.orientation_base_in_world)
-        seen = _ball_in_base(qpos, qvel)
+        seen = _in_base(_ball(qpos, qvel), qpos, qvel)
         if self.graph.base is None:
             place = rotate(back, reference.points[:, 0] - qpos[:, :3])
             miss = rotate(back, reference.object_position - qpos[:, BALL])
@@ -422,10 +421,10 @@ def _ball(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
     return np.hstack([qpos[:, BALL], qvel[:, FLIGHT]])
 
 
-def _ball_in_base(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """(k, 6) m and m/s of the ball, seen from bases that do not turn."""
+def _in_base(ball: np.ndarray, qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+    """(k, 6) m and m/s of a ``ball`` (k, 6) in the world, seen from bases that do not turn."""
     back = conjugate(qpos[:, 3:7])
-    apart = qpos[:, BALL] - qpos[:, :3], qvel[:, FLIGHT] - qvel[:, :3]
+    apart = ball[:, :3] - qpos[:, :3], ball[:, 3:] - qvel[:, :3]
     return np.concatenate([rotate(back, x) for x in apart], axis=1)
 
 

@@ -58,6 +58,7 @@ def _ball_geom(model: mujoco.MjModel) -> int:
     return int(model.geom(ball.NAME).id)
 
 
+LATEST = 4  # ticks, of object_delay
 TABLE: dict[str, Term] = {
     **ROBOT_TABLE,
     # the same ranges, of the robot's joints and geoms alone
@@ -77,13 +78,12 @@ TABLE: dict[str, Term] = {
     "object_velocity_noise": Term(0.0, 0.1, 1, "m/s, standard deviation: it is differentiated"),
     "object_delay": Term(
         2.0,
-        5.0,
+        LATEST + 1.0,
         1,
         "ticks (whole ones) since the sighting from which it is foretold: 40 ms of camera, and to believe it",
     ),
     "object_loss": Term(0.0, 0.05, 1, "chance a tick that the ball is lost from sight; its course is foretold then"),
 }
-LATEST = 4  # ticks, of object_delay
 LOSS_TICKS = (1, 8)  # how long it stays lost
 
 EXPANDED = ("geom_friction", "body_mass", "body_inertia", "body_ipos", "actuator_gainprm", "actuator_biasprm",

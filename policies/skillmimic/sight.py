@@ -17,11 +17,10 @@ LASTS = 0.6  # of a filter's error, what is left of it a tick later
 
 
 class Sight:
-    """``answer`` (robots, 6): m and m/s of the ball in the world, the last one given; ``lost`` (robots,): ticks until the
-    ball is seen again."""
+    """``lost`` (robots,): ticks until the ball is seen again."""
 
     def __init__(self, robots: int, period: float) -> None:
-        self.answer, self.lost = np.zeros((robots, 6)), np.zeros(robots, np.int64)
+        self.lost = np.zeros(robots, np.int64)
         self._period, self._all = period, np.arange(robots)
         self._past = np.zeros((LATEST + 1, robots, 6))  # m and m/s where the ball was, newest first
         self._held = np.zeros((LATEST + 1, robots), bool)
@@ -31,7 +30,7 @@ class Sight:
 
     def begin(self, ids: np.ndarray, truth: np.ndarray, held: np.ndarray) -> None:
         """Episodes of robots ``ids`` (k,) begin, with the ball in sight, ``truth`` (k, 6) and ``held`` (k,) bool."""
-        self.answer[ids], self._sighting[ids], self._in_hand[ids] = truth, truth, held
+        self._sighting[ids], self._in_hand[ids] = truth, held
         self.lost[ids] = self._age[ids] = self._ticks[ids] = 0
         self._error[ids] = 0.0
 
@@ -44,7 +43,7 @@ class Sight:
         noise: np.ndarray,
         rng: np.random.Generator,
     ) -> np.ndarray:
-        """This tick's ``answer``, of balls that are now ``truth`` (robots, 6) and ``held`` (robots,) bool, by anybody. The newest
+        """(robots, 6) m and m/s of the balls in the world as told this tick, of balls that are now ``truth`` (robots, 6) and ``held`` (robots,) bool, by anybody. The newest
         sighting is ``late`` (robots,) ticks old, or older: there is a ``chance`` (robots,) that the ball goes out of sight.
         ``noise`` (robots, 6): m and m/s, standard deviations of what the filter is off by."""
         self._past, self._held = np.roll(self._past, 1, axis=0), np.roll(self._held, 1, axis=0)
@@ -60,8 +59,7 @@ class Sight:
         self._age = np.where(sees, late, self._age + 1)
         self._ticks += 1
         self._error = LASTS * self._error + np.sqrt(1 - LASTS**2) * noise * rng.standard_normal(noise.shape)
-        self.answer = foretold(self._sighting, self._age * self._period, ~self._in_hand) + self._error
-        return self.answer
+        return foretold(self._sighting, self._age * self._period, ~self._in_hand) + self._error
 
 
 def foretold(seen: np.ndarray, dt: np.ndarray, flies: np.ndarray) -> np.ndarray:

@@ -258,7 +258,7 @@ def test_what_a_tracker_is_off_by_lasts_a_few_ticks():
 
 
 def test_a_ball_lost_from_the_first_tick_is_not_where_the_last_episodes_was(env):
-    env.sight.answer[:] = 9.0
+    env.sight._sighting[:] = 9.0
     env._start(np.arange(env.num_envs))
     env.sight.lost[:] = 3
     env._observe()

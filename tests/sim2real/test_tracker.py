@@ -195,7 +195,7 @@ def test_somebody_else_may_take_a_ball_out_of_its_flight():
 
 
 def test_the_delay_of_the_camera_is_foretold_away():
-    """What is left of 35 to 45 ms, as time: training draws it up to 10 ms (``policies/skillmimic/randomisation.py``)."""
+    """What is left of 35 to 45 ms, as time: training has nothing left of it (``policies/skillmimic/sight.py``)."""
     left = []
     for seed in range(10):
         _, times, errors, *_ = run(ballistic, CameraModel(), 0.6, seed=seed)
