@@ -240,8 +240,10 @@ class CanBus:
     def _ask(
         self, check: RegisterCheck, expected: list[float], clock: Clock, required: bool = True
     ) -> dict[int, float | int]:
-        """What every motor's register holds, {row: value}; not ``required``: only of those that say it. What is to be written goes ahead of each question, until it
-        has arrived: not every protocol confirms a write, and any frame may get lost."""
+        """What every motor's register holds, {row: value}; not ``required``: only of those that say it. What is to be
+        written goes ahead of each question, until it has arrived: not every protocol confirms a write, and any frame
+        may get lost.
+        """
         answers: dict[int, float | int] = {}
         motors = range(len(self.spec.motors))
 

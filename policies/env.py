@@ -27,8 +27,8 @@ class Env(VecEnv):
     """One policy period per step, ``config.envs`` robots.
 
     ``script`` (envs, ticks) of label indices fixes which skill is asked for when (evaluation: everything then starts at
-    home, and each robot keeps one velocity command); without it labels and commands change at random times. ``level`` in [0, 1] is the push curriculum; it adapts while
-    ``adaptive``, and None turns pushes off.
+    home, and each robot keeps one velocity command); without it labels and commands change at random times. ``level``
+    in [0, 1] is the push curriculum; it adapts while ``adaptive``, and None turns pushes off.
     """
 
     def __init__(self, config: Basics, seed: int, script: np.ndarray | None = None, level: float | None = 0.0) -> None:

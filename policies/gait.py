@@ -149,7 +149,9 @@ class Gait(nn.Module):
 
     @staticmethod
     def even(phase: Tensor) -> Tensor:
-        """Whether a walking base goes as fast as it does on average (N, 1) bool: the moment after a foot has left the ground."""
+        """Whether a walking base goes as fast as it does on average (N, 1) bool: the moment after a foot has left the
+        ground.
+        """
         step = 2 * phase - torch.floor(2 * phase)
         return (step > EVEN[0]) & (step < EVEN[1])
 

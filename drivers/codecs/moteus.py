@@ -358,8 +358,9 @@ class MoteusCodec:
         return make_fd_frames(self._silent_ids[row : row + 1], payload[None], len(payload))
 
     def unpack_registers(self, frames: np.ndarray) -> list[RegisterAnswer]:
-        """What the consoles said of what was asked for, serial numbers and home states. OK confirms a write; ERR stands for a value
-        that there is not."""
+        """What the consoles said of what was asked for, serial numbers and home states. OK confirms a write; ERR stands
+        for a value that there is not.
+        """
         answers = []
         rows = self.owners(frames)
         for frame, row in zip(frames[rows >= 0], rows[rows >= 0].tolist(), strict=True):

@@ -275,7 +275,9 @@ class OdriveCodec:
         return self._pack_questions()
 
     def pack_register(self, row: int, register: str, value: float | int | None = None) -> np.ndarray:
-        """A question for VERSION (FRAME, (1,)), or for SERIAL to everybody (none, as long as somebody may have firmware 0.5)."""
+        """A question for VERSION (FRAME, (1,)), or for SERIAL to everybody (none, as long as somebody may have firmware
+        0.5).
+        """
         if value is not None or register not in self.IDENTITY:
             raise KeyError(register)
         if register == "SERIAL" and not self._modern.all():

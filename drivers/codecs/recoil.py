@@ -2,11 +2,12 @@
 
     identifier = function (4 bits) << 7 | device (7 bits); a device answers function f + 1 of a PDO on f, an SDO on B
 
-The position law runs in the device, on gains that are its own state (parameters POSITION_KP and VELOCITY_KP), not part of a
-command: ``torque = kp (position - q) - kd dq``. A velocity target and a feed-forward torque are ignored in position mode.
-So a command (kp, kd, p, v, t) is sent as the position ``p + (kd v + t) / kp``, which makes the same torque; with kp = 0
-there is no such position, and v and t are lost; and the device keeps the sum within its position limits. Gains go out when they change, and one of the
-2 n in each tick again, so that a lost frame lasts 2 n ticks at most.
+The position law runs in the device, on gains that are its own state (parameters POSITION_KP and VELOCITY_KP), not part
+of a command: ``torque = kp (position - q) - kd dq``. A velocity target and a feed-forward torque are ignored in
+position mode. So a command (kp, kd, p, v, t) is sent as the position ``p + (kd v + t) / kp``, which makes the same
+torque; with kp = 0 there is no such position, and v and t are lost; and the device keeps the sum within its position
+limits. Gains go out when they change, and one of the 2 n in each tick again, so that a lost frame lasts 2 n ticks at
+most.
 
 Feedback of a command is position and velocity only. Mode, error and torque are asked by SDO, whose answers do not say what
 they answer: each motor is asked for one parameter at a time, and again only when it has answered or had time to.

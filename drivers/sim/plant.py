@@ -110,7 +110,9 @@ class Plant:
         self.data.qfrc_applied[self._qvel_at[self.joints.index(joint)]] = torque
 
     def weight_on(self, joint: str) -> tuple[float, float]:
-        """What a hand on a joint feels: the torque (N m) that keeps it from falling, and its inertia where it was built (kg m^2)."""
+        """What a hand on a joint feels: the torque (N m) that keeps it from falling, and its inertia where it was built
+        (kg m^2).
+        """
         at = int(self._qvel_at[self.joints.index(joint)])
         return float(self.data.qfrc_bias[at]), float(self.model.dof_M0[at])
 

@@ -1,7 +1,7 @@
 """The host's ends of a World in another process (see serve.py): unix SEQPACKET sockets, a whole tick a datagram.
 
-A bus socket carries rows of FRAME, of a CAN-FD bus of FD_FRAME. What SocketCAN would tell in error frames, the served bus tells in the same ones
-(linux/can/error.h), and sending then raises as it would on a real controller.
+A bus socket carries rows of FRAME, of a CAN-FD bus of FD_FRAME. What SocketCAN would tell in error frames, the served
+bus tells in the same ones (linux/can/error.h), and sending then raises as it would on a real controller.
 """
 
 from __future__ import annotations

@@ -8,8 +8,9 @@ A motor at another bit rate takes every frame for an error and breaks it off, un
 then the host's controller is error-passive too, or has left the bus: the slower the stranger, the longer its error flags.
 The host hears of its controller what Linux tells: error-passive, bus-off, restarted.
 
-Not modelled: other error-passive nodes, how counters fall again after errors other than those, overload frames, two nodes sending one identifier at once, clock tolerance, an error in
-the middle of a CAN-FD payload (it breaks the frame off at its end).
+Not modelled: other error-passive nodes, how counters fall again after errors other than those, overload frames, two
+nodes sending one identifier at once, clock tolerance, an error in the middle of a CAN-FD payload (it breaks the frame
+off at its end).
 """
 
 from __future__ import annotations

@@ -34,8 +34,8 @@ class Library(Strict):
     """Every piece that a robot's skills are trained on."""
 
     skills: dict[str, list[Piece]]
-    # made by formula: bounces (bounce.py) by these hands, or the right one, stretched, for robots that stand or walk, and pickups
-    # from the floor (pickup.py)
+    # made by formula: bounces (bounce.py) by these hands, or the right one, stretched, for robots that stand or walk,
+    # and pickups from the floor (pickup.py)
     formulas: dict[str, list[Literal["left", "right", "stretched", "both", "walking", "floor"]]] = {}
 
 

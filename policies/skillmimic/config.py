@@ -67,6 +67,8 @@ class SkillMimic:
     push_chance: float = 0.01  # a tick
     push_speed: float = 0.3  # m/s, the largest
     terminations: tuple[str, ...] = ("fallen", "tilted", "ball_lost", "broken")
+    # more of them, in training alone: what no skill's rule counts as a failure, but nothing is to be learned from
+    hopeless: tuple[str, ...] = ()
     # the learner
     horizon: int = 24  # ticks per iteration
     learning_rate: float = 5e-4
@@ -115,7 +117,8 @@ TASKS: dict[str, SkillMimic] = {
     "g1-dribble": replace(GENTLE, base=BASE, skills=("dribble_in_place",), clips=("dribble_in_place_03",), corrections=DRIBBLE,
                           meets=("dribble_in_place",), stands=2.0, variant="bounces", timestep=0.002, easy=0.15, frames=200,
                           disturbed=0.3, push_chance=0.0, gamma=0.99, std=0.2, ppo={**GENTLE.ppo, "schedule": "adaptive"},
-                          samples=30e6, save_every=20, evaluate_every=200, evaluate_envs=96, evaluate_seconds=10.0),
+                          hopeless=("dead",), samples=30e6, save_every=20, evaluate_every=200, evaluate_envs=96,
+                          evaluate_seconds=10.0),
     "g1-pickup": replace(GENTLE, base=DOWN, skills=("pickup",), clips=("pickup_09",), frames=400,
                          samples=0.4e6, save_every=8, evaluate_every=8, evaluate_envs=64),
 }  # fmt: skip

@@ -119,7 +119,7 @@ class Env(VecEnv):
             seen = features(now.state)
             rewards = self.discriminator.reward(np.concatenate([self._last_features, seen], axis=1))
             self.terms, self._last_features = {"discriminator": rewards}, seen
-        self.failures = failed(now, self.config.terminations)
+        self.failures = failed(now, (*self.config.terminations, *self.config.hopeless))
         rewards[~np.isfinite(rewards)] = 0.0
         self.episode_length_buf += 1
         over = self.episode_length_buf.numpy() >= self.max_episode_length
@@ -194,7 +194,9 @@ class Env(VecEnv):
         self._aims[ids] -= 1
 
     def _flight(self, clip: np.ndarray, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the balls of clips ``clip`` (k,) are thrown from, (k, 3) m, and how, (k, 3) m/s, at robots of ``qpos`` (k, nq)."""
+        """Where the balls of clips ``clip`` (k,) are thrown from, (k, 3) m, and how, (k, 3) m/s, at robots of ``qpos``
+        (k, nq).
+        """
         place, velocity = np.array([self._throws[c] for c in clip]).transpose(1, 0, 2)
         turn = quaternion_from_rotation_vector(heading(qpos[:, 3:7])[:, None] * [0.0, 0.0, 1.0])
         return qpos[:, :3] * [1.0, 1.0, 0.0] + rotate(turn, place), rotate(turn, velocity)

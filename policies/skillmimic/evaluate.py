@@ -172,8 +172,8 @@ def evaluate(
     seed: int = 0,
     act: Callable[[Env], Tensor] | None = None,
 ) -> dict[str, Result]:
-    """Of every skill (of ``skills``), ``episodes`` of ``seconds`` from the beginning of a clip (a clip that ends is over ``config.after`` s
-    after its end), with robots and balls drawn from randomisation that training never saw.
+    """Of every skill (of ``skills``), ``episodes`` of ``seconds`` from the beginning of a clip (a clip that ends is
+    over ``config.after`` s after its end), with robots and balls drawn from randomisation that training never saw.
 
     ``push``: m/s, the largest of random pushes. ``act``: what to do, (episodes, actions); by default what ``graph.actor``
     says.
@@ -238,6 +238,7 @@ def episodes_of(
         anywhere=skill not in RULES,
         disturbed=0.0,
         easy=1.0,
+        hopeless=(),
     )
     env = Env(config, UNSEEN + seed, graph, skill)
     if fixed:

@@ -152,9 +152,10 @@ class Plan(nn.Module):
         ball: Tensor,
         calm: Tensor,
     ) -> Planned:
-        """``skill`` (N, labels) one-hot, and that of the tick before with its clock (N, 1) and targets (N, arms); ``ball``
-        (N, 6) m and m/s in the base; ``calm`` (N, 1) bool: the feet have rested (or are at the right place of a stride), without
-        which no ball is let go that is to come back, and no leg bent."""
+        """``skill`` (N, labels) one-hot, and that of the tick before with its clock (N, 1) and targets (N, arms);
+        ``ball`` (N, 6) m and m/s in the base; ``calm`` (N, 1) bool: the feet have rested (or are at the right place of
+        a stride), without which no ball is let go that is to come back, and no leg bent.
+        """
         same = (skill * last_skill).sum(dim=-1, keepdim=True)
         last, loop, ready = skill @ self.last, skill @ self.loop, skill @ self.ready
         clock, rate = self._step(skill, same * last_clock, same, last, loop, ball, calm)

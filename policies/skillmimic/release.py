@@ -146,7 +146,7 @@ def network_in(path: Path) -> nn.Module:
 def record(graph: PolicyGraph) -> tuple[list[dict[str, np.ndarray]], list[dict[str, np.ndarray]]]:
     """Closed-loop recordings from the start of episodes, one a robot; and the same signals of many robots, tick by tick."""
     config = dataclasses.replace(
-        graph.config, envs=64, frames=10 * GOLDEN_STEPS, variant="skillmimic", terminations=("broken",)
+        graph.config, envs=64, frames=10 * GOLDEN_STEPS, variant="skillmimic", terminations=("broken",), hopeless=()
     )
     env = Env(config, UNSEEN + 3, graph)
     env.episode_length_buf[:] = 0

@@ -43,9 +43,12 @@ class Sight:
         noise: np.ndarray,
         rng: np.random.Generator,
     ) -> np.ndarray:
-        """(robots, 6) m and m/s of the balls in the world as told this tick, of balls that are now ``truth`` (robots, 6) and ``held`` (robots,) bool, by anybody. The newest
-        sighting is ``late`` (robots,) ticks old, or older: there is a ``chance`` (robots,) that the ball goes out of sight.
-        ``noise`` (robots, 6): m and m/s, standard deviations of what the filter is off by."""
+        """(robots, 6) m and m/s: where in the world the balls are now, as trackers tell it. What they truly are is ``truth``
+        (robots, 6), and whether somebody holds them ``held`` (robots,) bool.
+
+        The newest sighting is ``late`` (robots,) ticks old, or older: there is a ``chance`` (robots,) that the ball goes
+        out of sight. ``noise`` (robots, 6): m and m/s, standard deviations of what the filter is off by.
+        """
         self._past, self._held = np.roll(self._past, 1, axis=0), np.roll(self._held, 1, axis=0)
         self._past[0], self._held[0] = truth, held
         out = (self.lost == 0) & (rng.random(len(chance)) < chance)

@@ -6,11 +6,16 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from policies import ball
+from policies.skillmimic.plan import GRAVITY
 from policies.skillmimic.rewards import Step, off
 
 # m between ball and its reference, seen from the first key point, while the reference has it in hand; of a ball that
 # bounces, at any time and over the floor: after that one the robot can still go
 BALL_LOST, BALL_GONE = 0.3, 0.5
+# m above the floor, its centre: what a ball has to come up to again for a hand to bounce it; and that of one which is on the
+# floor, in another's hands or pressed flat, and may yet
+DEAD, FLAT = 0.54, 0.11
 FALLEN, SUNK = 0.3, 0.2  # m: how low a base has fallen; and how far below its reference, where that is as low
 
 
@@ -26,11 +31,18 @@ def _ball_lost(s: Step) -> np.ndarray:
     return (s.bounces | (s.reference.contact[:, 0] > 0)) & (np.linalg.norm(away, axis=1) > limit)
 
 
+def _dead(s: Step) -> np.ndarray:
+    height = s.state.object_position[:, 2]
+    peak = np.maximum(height, ball.RADIUS) + s.state.object_velocity[:, 2] ** 2 / (2 * GRAVITY)
+    return s.bounces & (s.state.contact[:, 0] == 0) & (height > FLAT) & (peak < DEAD)
+
+
 TERMINATIONS: dict[str, Callable[[Step], np.ndarray]] = {
     "fallen": lambda s: s.height < np.minimum(FALLEN, s.height_reference - SUNK),
     # 0.6 rad more than the reference leans; a bending pickup leans too
     "tilted": lambda s: np.arccos(np.clip(s.up, -1, 1)) > np.arccos(np.clip(s.up_reference, -1, 1)) + 0.6,
     "ball_lost": _ball_lost,
+    "dead": _dead,
     "broken": lambda s: ~np.isfinite(s.state.joint_vel).all(axis=1) | (np.abs(s.state.joint_vel).max(axis=1) > 60.0),
 }
 

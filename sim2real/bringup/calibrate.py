@@ -1,9 +1,10 @@
 """Where a joint's zero is on its motor, and which way it turns: found by moving it by hand from one stop to the other.
 
 Motors are off and only asked. The range of the joint is known from the YAML, that of the motor is measured; they lie on
-each other in two ways, and the order in which the joint was held at its ends, the lower one first, tells which. Where the
-body blocks one stop (``reach`` in the YAML), the other is enough, touched twice. Then the robot hangs still, and two checks find what a hand did wrong: a limp joint at rest bears no more torque than its friction
-holds, and left and right hang alike.
+each other in two ways, and the order in which the joint was held at its ends, the lower one first, tells which. Where
+the body blocks one stop (``reach`` in the YAML), the other is enough, touched twice. Then the robot hangs still, and
+two checks find what a hand did wrong: a limp joint at rest bears no more torque than its friction holds, and left and
+right hang alike.
 """
 
 from __future__ import annotations

@@ -28,8 +28,9 @@ class Span(NamedTuple):
 
 
 class Run:
-    """``tick`` (n,), ``pilot`` (m,) and ``object`` (k,) are the recorded arrays; the latter two may be empty. Times are seconds since the
-    first tick. Raises Sim2realError as ``Reader`` does, and where the record holds no tick."""
+    """``tick`` (n,), ``pilot`` (m,) and ``object`` (k,) are the recorded arrays; the latter two may be empty. Times are
+    seconds since the first tick. Raises Sim2realError as ``Reader`` does, and where the record holds no tick.
+    """
 
     def __init__(self, path: Path | str) -> None:
         self.reader = Reader(path)

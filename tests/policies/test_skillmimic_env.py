@@ -154,6 +154,7 @@ def test_a_lost_ball_ends_the_episode(env):
         ("tilted", lambda s: s.up.__setitem__(0, np.cos(1.2))),
         ("broken", lambda s: s.state.joint_vel.__setitem__((0, 3), np.nan)),
         ("ball_lost", lambda s: s.state.object_position.__setitem__(0, s.state.object_position[0] + 0.2)),
+        ("dead", lambda s: fly(s, 0.5)),
     ],
 )
 def test_terminations(env, name, change):
@@ -162,6 +163,34 @@ def test_terminations(env, name, change):
     now = copy.deepcopy(env.now)
     change(now)
     assert TERMINATIONS[name](now).tolist() == [True] + [False] * 7
+
+
+def fly(s, height, speed=0.0):
+    """The first robot's ball is one to bounce, and nobody touches it."""
+    s.bounces[0], s.state.contact[0] = True, 0.0
+    s.state.object_position[0, 2], s.state.object_velocity[0] = height, (0.0, 0.0, speed)
+
+
+@pytest.mark.parametrize(
+    ("height", "speed", "dead"),
+    [(0.55, 0.0, False), (0.12, 2.8, True), (0.12, -3.0, False), (0.1, 0.0, False), (0.08, 1.0, False)],
+    ids=["high", "slow", "fast", "in other hands", "pressed flat"],
+)
+def test_a_ball_is_dead_that_comes_up_to_no_hand(env, height, speed, dead):
+    env.step(still(env))
+    fly(env.now, height, speed)
+    assert TERMINATIONS["dead"](env.now)[0] == dead
+    env.now.state.contact[0, 0] = 1.0
+    assert not TERMINATIONS["dead"](env.now)[0]
+
+
+def test_what_is_hopeless_ends_episodes_of_training_alone(graph, monkeypatch):
+    training = Env(dataclasses.replace(CONFIG, terminations=("broken",), hopeless=("ball_lost",)), 0, graph)
+    training._qpos[2, BALL] += (1.0, 0.0, 0.0)
+    training.step(still(training))
+    assert training.failures.tolist() == [k == 2 for k in range(8)]
+    monkeypatch.setattr(graph, "config", training.config)
+    assert episodes_of(graph, "hold", 2, 1.0).config.hopeless == ()
 
 
 # seeing
