@@ -13,9 +13,9 @@ from policies.skillmimic.rewards import Step, off
 # m between ball and its reference, seen from the first key point, while the reference has it in hand; of a ball that
 # bounces, at any time and over the floor: after that one the robot can still go
 BALL_LOST, BALL_GONE = 0.3, 0.5
-# m above the floor, its centre: what a ball has to come up to again for a hand to bounce it; and that of one which is on the
-# floor, in another's hands or pressed flat, and may yet
-DEAD, FLAT = 0.54, 0.11
+# m above the floor, its centre, seen from a trunk as high as the reference's: what a ball has to come up to again for a hand to
+# bounce it; and that of one which is on the floor, in another's hands or pressed flat, and may yet
+DEAD, FLAT = 0.54, 0.2
 FALLEN, SUNK = 0.3, 0.2  # m: how low a base has fallen; and how far below its reference, where that is as low
 
 

@@ -173,7 +173,7 @@ def fly(s, height, speed=0.0):
 
 @pytest.mark.parametrize(
     ("height", "speed", "dead"),
-    [(0.55, 0.0, False), (0.12, 2.8, True), (0.12, -3.0, False), (0.1, 0.0, False), (0.08, 1.0, False)],
+    [(0.55, 0.0, False), (0.25, 2.3, True), (0.25, -3.0, False), (0.15, 0.0, False), (0.08, 1.0, False)],
     ids=["high", "slow", "fast", "in other hands", "pressed flat"],
 )
 def test_a_ball_is_dead_that_comes_up_to_no_hand(env, height, speed, dead):
@@ -182,6 +182,15 @@ def test_a_ball_is_dead_that_comes_up_to_no_hand(env, height, speed, dead):
     assert TERMINATIONS["dead"](env.now)[0] == dead
     env.now.state.contact[0, 0] = 1.0
     assert not TERMINATIONS["dead"](env.now)[0]
+
+
+def test_a_ball_that_is_aimed_is_not_dead():
+    config = dataclasses.replace(TASKS["g1-dribble"], envs=16, threads=1, anywhere=False, frames=200)
+    env = Env(config, 0)
+    env.episode_length_buf[:] = 0
+    for _ in range(round(AIMING / config.period) + 10):
+        env.step(still(env))
+        assert not env.failures.any()
 
 
 def test_what_is_hopeless_ends_episodes_of_training_alone(graph, monkeypatch):
