@@ -144,6 +144,11 @@ def contact(s: Step, k: Sensitivity) -> np.ndarray:
     return np.exp(-k.contact * np.abs(s.state.contact - s.reference.contact).sum(axis=1))
 
 
+def peak(m: Motion) -> np.ndarray:
+    """(N,) m, how high the ball's centre would rise if it flew off upwards now: its energy, as a height."""
+    return m.object_position[:, 2] + m.object_velocity[:, 2] ** 2 / (2 * GRAVITY)
+
+
 # m: errors of a bounced ball that cost 63 %
 BESIDE, LOW, HIGH = 0.2, 0.2, 0.3
 MET = 0.75  # m: how high its centre is when a palm meets it
@@ -166,9 +171,7 @@ def returns(s: Step, k: Sensitivity) -> np.ndarray:
 
 def lively(s: Step, k: Sensitivity) -> np.ndarray:
     """While nobody touches it, it has the energy, as a height, of the reference: less of it costs more."""
-    here, there = (
-        m.object_position[:, 2] + m.object_velocity[:, 2] ** 2 / (2 * GRAVITY) for m in (s.state, s.reference)
-    )
+    here, there = peak(s.state), peak(s.reference)
     over = here - there
     wrong = (np.minimum(over, 0.0) / LOW) ** 2 + (np.maximum(over, 0.0) / HIGH) ** 2
     held = (s.state.contact[:, 0] > 0) | (s.reference.contact[:, 0] > 0)

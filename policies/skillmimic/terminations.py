@@ -1,4 +1,5 @@
-"""When an episode has failed. The released code knows only the first; a run chooses by ``config.terminations``."""
+"""When an episode has failed. The released code knows only the first; a run chooses by ``config.terminations``, and its
+training ends more of them by ``config.hopeless``."""
 
 from __future__ import annotations
 
@@ -6,9 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from policies import ball
-from policies.skillmimic.plan import GRAVITY
-from policies.skillmimic.rewards import Step, off
+from policies.skillmimic.rewards import Step, off, peak
 
 # m between ball and its reference, seen from the first key point, while the reference has it in hand; of a ball that
 # bounces, at any time and over the floor: after that one the robot can still go
@@ -32,9 +31,8 @@ def _ball_lost(s: Step) -> np.ndarray:
 
 
 def _dead(s: Step) -> np.ndarray:
-    height = s.state.object_position[:, 2]
-    peak = np.maximum(height, ball.RADIUS) + s.state.object_velocity[:, 2] ** 2 / (2 * GRAVITY)
-    return s.bounces & (s.state.contact[:, 0] == 0) & (height > FLAT) & (peak < DEAD)
+    flies = (s.state.contact[:, 0] == 0) & (s.state.object_position[:, 2] > FLAT)
+    return s.bounces & flies & (peak(s.state) < DEAD)
 
 
 TERMINATIONS: dict[str, Callable[[Step], np.ndarray]] = {
