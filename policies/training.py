@@ -7,6 +7,7 @@ import copy
 import dataclasses
 import io
 import json
+import math
 import os
 import subprocess
 import time
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from rsl_rl.algorithms import PPO
+from rsl_rl.modules.distribution import GaussianDistribution
 from torch import nn
 
 from sim2real.types import Sim2realError
@@ -88,6 +90,7 @@ class Training:
                 if first:
                     self._save("last.pt")
                 self.env.reset()  # what a resumed run does too, so both continue alike
+                self.ppo.actor.distribution.forget()
 
     def step(self) -> dict[str, float]:
         """One iteration: collect ``horizon`` ticks, update. Returns a row of the curve."""
@@ -194,12 +197,35 @@ def learner_device(name: str) -> torch.device:
     return torch.device(name, int(os.environ.get("LOCAL_RANK", 0)) % torch.cuda.device_count())
 
 
-def make_ppo(config: Any, env: Any, actor: dict, critic: dict, sees: dict[str, list[str]]) -> PPO:
+class LastingNoise(GaussianDistribution):
+    """Of what an action was off by, ``lasts`` is still there a tick later; each tick's actions are distributed as ever,
+    which is what PPO reckons with.
+
+    Noise that is drawn anew every tick hardly moves an arm, so its rewards tell little of what the arm might have done
+    otherwise (correlated noise in PPO: Hollenstein, Martius and Piater, AAAI 2024).
+    """
+
+    def __init__(self, output_dim: int, lasts: float, **settings: Any) -> None:
+        super().__init__(output_dim, **settings)
+        self._lasts, self._off = lasts, torch.zeros(0)
+
+    def forget(self) -> None:
+        """What comes next has nothing to do with what was."""
+        self._off = torch.zeros(0)
+
+    def sample(self) -> torch.Tensor:
+        fresh = torch.randn_like(self.mean)
+        known = self._off.shape == fresh.shape
+        self._off = self._lasts * self._off + math.sqrt(1 - self._lasts**2) * fresh if known else fresh
+        return self.mean + self.std * self._off
+
+
+def make_ppo(config: Any, env: Any, actor: dict, critic: dict, sees: dict[str, list[str]], lasts: float = 0.0) -> PPO:
     """rsl_rl's PPO. ``actor`` and ``critic``: rsl_rl's settings of each network, beyond ``config``'s; ``sees``: which
-    groups of observations each is given."""
+    groups of observations each is given; ``lasts``: of the actions' noise (``LastingNoise``)."""
     rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     network = {"class_name": "MLPModel", "hidden_dims": list(config.hidden), "activation": "elu"}
-    noise = {"class_name": "GaussianDistribution", "init_std": config.std, "std_type": "scalar"}
+    noise = {"class_name": LastingNoise, "lasts": lasts, "init_std": config.std, "std_type": "scalar"}
     settings = {
         "num_steps_per_env": config.horizon,
         "obs_groups": sees,

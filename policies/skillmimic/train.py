@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.modules import MLP
 
@@ -22,7 +23,7 @@ class SkillTraining(training.Training):
     def make(self, seed: int) -> tuple[Env, PPO]:
         env = Env(self.config, seed)
         sees = {"actor": ["policy"], "critic": ["policy", "privileged"]}
-        return env, training.make_ppo(self.config, env, {}, {}, sees)
+        return env, training.make_ppo(self.config, env, {}, {}, sees, self.config.lasts)
 
     def step(self) -> dict[str, float]:
         """With the mean of every sub-reward at the iteration's last tick."""
@@ -44,6 +45,12 @@ class SkillTraining(training.Training):
             **{name: mean(name) for name in ("accuracy", "body_error", "ball_error", "contact_error")},
             **{f"success_{skill}": value for skill, value in success.items()},
         }
+
+    def start_from(self, checkpoint: Path) -> None:
+        """With the noise of a start."""
+        super().start_from(checkpoint)
+        with torch.no_grad():
+            self.ppo.actor.distribution.std_param.fill_(self.config.std)
 
     def graph(self) -> PolicyGraph:
         graph = self.env.graph

@@ -13,6 +13,7 @@ from policies.skillmimic.amp import Discriminator, features
 from policies.skillmimic.config import TASKS, SkillMimic
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.train import SkillTraining, load_config, load_graph
+from policies.training import LastingNoise
 from sim2real.types import Sim2realError
 
 TINY = dataclasses.replace(
@@ -37,6 +38,42 @@ def test_a_run_writes_its_settings_its_curve_and_its_best_policy(tmp_path):
     torch.testing.assert_close(again.ppo.actor.state_dict(), training.ppo.actor.state_dict())
     again.run()
     assert again.samples == 96
+
+
+def test_noise_lasts_until_a_checkpoint_and_a_resumed_run_continues_exactly(tmp_path):
+    config = dataclasses.replace(TINY, lasts=0.9, evaluate_every=1000)
+    whole = SkillTraining(config, tmp_path / "whole")
+    whole.run()
+    SkillTraining(dataclasses.replace(config, samples=32), tmp_path / "split").run()
+    rest = SkillTraining(config, tmp_path / "split")
+    assert rest.resume() and rest.samples == 32
+    rest.run()
+    torch.testing.assert_close(rest.ppo.actor.state_dict(), whole.ppo.actor.state_dict(), rtol=0, atol=0)
+
+
+def test_noise_that_lasts_is_as_large_as_noise_that_does_not():
+    torch.manual_seed(0)
+    noise = LastingNoise(4, lasts=0.9, init_std=0.5)
+    noise.update(torch.ones(2000, 4))
+    drawn = torch.stack([noise.sample() for _ in range(20)]) - 1
+    assert abs(drawn[0].std() - 0.5) < 0.02 and abs(drawn[-1].std() - 0.5) < 0.02
+    together = lambda a, b: float((a * b).mean() / (a.std() * b.std()))  # noqa: E731
+    assert abs(together(drawn[-2], drawn[-1]) - 0.9) < 0.02
+    noise.forget()
+    assert abs(together(drawn[-1], noise.sample() - 1)) < 0.05
+    again = LastingNoise(4, lasts=0.0, init_std=0.5)
+    again.update(torch.ones(2000, 4))
+    assert abs(together(again.sample() - 1, again.sample() - 1)) < 0.05
+
+
+def test_a_start_from_another_run_has_the_noise_of_a_start(tmp_path):
+    first = SkillTraining(TINY, tmp_path / "first")
+    first.run()
+    assert float(first.ppo.actor.distribution.std_param.max()) != TINY.std
+    second = SkillTraining(TINY, tmp_path / "second")
+    second.start_from(tmp_path / "first" / "last.pt")
+    assert (second.ppo.actor.distribution.std_param == TINY.std).all()
+    torch.testing.assert_close(second.ppo.actor.mlp.state_dict(), first.ppo.actor.mlp.state_dict())
 
 
 def test_a_run_of_another_version_is_named(tmp_path):
