@@ -202,11 +202,12 @@ class LastingNoise(GaussianDistribution):
     which is what PPO reckons with.
 
     Noise that is drawn anew every tick hardly moves an arm, so its rewards tell little of what the arm might have done
-    otherwise (correlated noise in PPO: Hollenstein, Martius and Piater, AAAI 2024).
+    otherwise (correlated noise in PPO: Hollenstein, Martius and Piater, AAAI 2024). Noise that lasts is not learned but
+    stays as large as it is: PPO would shrink it, since it costs reward, and with it what the rewards tell.
     """
 
     def __init__(self, output_dim: int, lasts: float, **settings: Any) -> None:
-        super().__init__(output_dim, **settings)
+        super().__init__(output_dim, learn_std=lasts == 0, **settings)
         self._lasts, self._off = lasts, torch.zeros(0)
 
     def forget(self) -> None:

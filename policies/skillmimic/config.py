@@ -75,7 +75,8 @@ class SkillMimic:
     samples: float = 20e6
     gamma: float = 0.97
     std: float = 0.15  # of the actions at the start; 0.25 costs a fifth of the reward of standing still
-    lasts: float = 0.0  # of what an action is off by, this much is left a tick later
+    # of what an action is off by, this much is left a tick later; if anything is, ``std`` is not learned
+    lasts: float = 0.0
     ppo: dict[str, float | int | str | bool] = field(
         default_factory=lambda: {
             "num_learning_epochs": 4,
@@ -117,9 +118,9 @@ TASKS: dict[str, SkillMimic] = {
     # The physics in the deployed worlds' steps: in longer ones chance decides where a ball goes that a palm has pushed.
     "g1-dribble": replace(GENTLE, base=BASE, skills=("dribble_in_place",), clips=("dribble_in_place_03",), corrections=DRIBBLE,
                           meets=("dribble_in_place",), stands=2.0, variant="bounces", timestep=0.002, easy=0.15, frames=200,
-                          disturbed=0.3, push_chance=0.0, gamma=0.99, std=0.2, lasts=0.9, ppo={**GENTLE.ppo, "schedule": "adaptive"},
-                          hopeless=("dead",), samples=30e6, save_every=20, evaluate_every=200, evaluate_envs=96,
-                          evaluate_seconds=10.0),
+                          disturbed=0.3, push_chance=0.0, gamma=0.99, std=0.25, lasts=0.9, hopeless=("dead",),
+                          ppo={**GENTLE.ppo, "schedule": "adaptive"}, samples=30e6, save_every=20, evaluate_every=200,
+                          evaluate_envs=96, evaluate_seconds=10.0),
     "g1-pickup": replace(GENTLE, base=DOWN, skills=("pickup",), clips=("pickup_09",), frames=400,
                          samples=0.4e6, save_every=8, evaluate_every=8, evaluate_envs=64),
 }  # fmt: skip

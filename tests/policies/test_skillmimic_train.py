@@ -48,6 +48,7 @@ def test_noise_lasts_until_a_checkpoint_and_a_resumed_run_continues_exactly(tmp_
     rest = SkillTraining(config, tmp_path / "split")
     assert rest.resume() and rest.samples == 32
     rest.run()
+    assert (rest.ppo.actor.distribution.std_param == config.std).all()
     torch.testing.assert_close(rest.ppo.actor.state_dict(), whole.ppo.actor.state_dict(), rtol=0, atol=0)
 
 
