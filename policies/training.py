@@ -90,12 +90,12 @@ class Training:
                 if first:
                     self._save("last.pt")
                 self.env.reset()  # what a resumed run does too, so both continue alike
-                self.ppo.actor.distribution.forget()
 
     def step(self) -> dict[str, float]:
         """One iteration: collect ``horizon`` ticks, update. Returns a row of the curve."""
         config, ppo, env, device = self.config, self.ppo, self.env, self.device
         ppo.train_mode()
+        ppo.actor.distribution.forget()  # what rsl_rl's last update drew
         total, survived, fell = 0.0, 0, 0
         with torch.no_grad():
             observations = env.get_observations().to(device)
@@ -198,8 +198,8 @@ def learner_device(name: str) -> torch.device:
 
 
 class LastingNoise(GaussianDistribution):
-    """Of what an action was off by, ``lasts`` is still there a tick later; each tick's actions are distributed as ever,
-    which is what PPO reckons with.
+    """Of what an action was off by, ``lasts`` is still there a tick later, within an iteration; each tick's actions are
+    distributed as ever, which is what PPO reckons with.
 
     Noise that is drawn anew every tick hardly moves an arm, so its rewards tell little of what the arm might have done
     otherwise (correlated noise in PPO: Hollenstein, Martius and Piater, AAAI 2024). Noise that lasts is not learned but
@@ -216,7 +216,7 @@ class LastingNoise(GaussianDistribution):
 
     def sample(self) -> torch.Tensor:
         fresh = torch.randn_like(self.mean)
-        known = self._off.shape == fresh.shape
+        known = self._off.shape == fresh.shape  # an update draws too, for as many as are in its batch
         self._off = self._lasts * self._off + math.sqrt(1 - self._lasts**2) * fresh if known else fresh
         return self.mean + self.std * self._off
 

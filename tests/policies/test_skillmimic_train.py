@@ -40,7 +40,7 @@ def test_a_run_writes_its_settings_its_curve_and_its_best_policy(tmp_path):
     assert again.samples == 96
 
 
-def test_noise_lasts_until_a_checkpoint_and_a_resumed_run_continues_exactly(tmp_path):
+def test_a_resumed_run_with_noise_that_lasts_continues_exactly(tmp_path):
     config = dataclasses.replace(TINY, lasts=0.9, evaluate_every=1000)
     whole = SkillTraining(config, tmp_path / "whole")
     whole.run()
