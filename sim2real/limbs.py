@@ -1,4 +1,4 @@
-"""Where a robot's palms are and how its base moves over the floor, by its joints, its IMU and its MJCF."""
+"""Where a robot's palms and solid parts are and how its base moves over the floor, by its joints, its IMU and its MJCF."""
 
 # MuJoCo ships no types.
 # pyright: reportAttributeAccessIssue=false
@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sim2real.config import RobotConfig
+from sim2real.quaternion import matrix_of
+from sim2real.solids import Solids
 
 SOON = 1e-3  # s over which velocities are differences
 
@@ -20,11 +22,13 @@ class Limbs(NamedTuple):
     palms: np.ndarray = np.zeros((0, 3))  # (k, 3) m in the base; none: nobody knows where they are
     base: np.ndarray | None = None  # (3,) m: z above the soles, x and y of an origin that drifts; None: nobody knows
     velocity: np.ndarray = np.zeros(3)  # (3,) m/s of the base
+    solids: Solids = Solids()  # in the base
 
 
 class Kinematics:
     """``kinematics(...)`` every tick -> Limbs: palms and soles are the sites of the robot's MJCF whose names end in ``_palm``
-    and ``_foot``. A robot without such soles says nothing of its base.
+    and ``_foot``, solids its geoms that touch what has MuJoCo's own ``contype`` and ``conaffinity``. A robot without such soles
+    says nothing of its base.
 
     The soles nearest to the floor stand still on it, and the base moves as they say (leg odometry).
     """
@@ -42,6 +46,11 @@ class Kinematics:
         }
         self._sites, self._palms = sites["_palm"] + sites["_foot"], len(sites["_palm"])
         self._root = model.body(robot.base).id
+        self._geoms = np.flatnonzero(((model.geom_contype | model.geom_conaffinity) & 1) * model.geom_bodyid)
+        self._middles, around = model.geom_aabb[self._geoms, :3], model.geom_aabb[self._geoms, 3:]
+        round_ones = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+        rounds = np.where(np.isin(model.geom_type[self._geoms], round_ones), model.geom_size[self._geoms, 0], 0.0)
+        self._shapes = around - rounds[:, None], rounds
         self._joints = [model.joint(name).qposadr[0] for name in robot.joint_names]
         self._soles: np.ndarray | None = None  # (feet, 3) m from the base, in the world's axes, a tick ago
         self._last: np.ndarray | None = None  # that was answered of the base
@@ -58,17 +67,18 @@ class Kinematics:
             self._soles = None
             return Limbs(base=self._last)
         palms, feet = self._points(joint_pos)
+        solids = self._solids()
         if not len(feet):
-            return Limbs(palms)
+            return Limbs(palms, solids=solids)
         _, soon = self._points(joint_pos + SOON * joint_vel)
-        turn = _matrix(orientation)
+        turn = matrix_of(orientation)
         soles = feet @ turn.T
         moving = ((soon - feet) / SOON + np.cross(angular_velocity, feet)) @ turn.T
         stand = soles[:, 2] < soles[:, 2].min() + self.near
         if self._soles is not None:
             self._place -= (soles - self._soles)[stand, :2].mean(axis=0)
         self._soles, self._last = soles, np.append(self._place, -soles[:, 2].min())
-        return Limbs(palms, self._last, -moving[stand].mean(axis=0))
+        return Limbs(palms, self._last, -moving[stand].mean(axis=0), solids)
 
     def _points(self, joint_pos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Palms (k, 3) and soles (feet, 3), m in the base."""
@@ -78,14 +88,10 @@ class Kinematics:
         points = (data.site_xpos[self._sites] - data.xpos[self._root]) @ data.xmat[self._root].reshape(3, 3)
         return points[: self._palms], points[self._palms :]
 
-
-def _matrix(q: np.ndarray) -> np.ndarray:
-    """(3, 3) of a quaternion (4,) of about unit length."""
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    def _solids(self) -> Solids:
+        """With the joints where ``_points`` has put them; what is neither box, capsule nor sphere is the box around it."""
+        data = self._data
+        turn = data.xmat[self._root].reshape(3, 3)
+        turns = data.geom_xmat[self._geoms].reshape(-1, 3, 3)
+        places = data.geom_xpos[self._geoms] + (turns @ self._middles[:, :, None])[:, :, 0]
+        return Solids((places - data.xpos[self._root]) @ turn, turn.T @ turns, *self._shapes)

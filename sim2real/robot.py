@@ -16,6 +16,7 @@ from drivers.bus import Clock, Imu, ImuState, MotorBus, MotorCommand, MotorState
 from drivers.can_bus import joined
 from drivers.open import open_bus, open_imu
 from sim2real.config import RobotConfig, Wiring
+from sim2real.quaternion import matrix_of, multiply
 from sim2real.types import JointCommand, RobotState
 
 
@@ -166,21 +167,3 @@ def open_robot(
         buses = [replace(b, interface="sim", channel=f"{simulated_in}/{b.name}.sock") for b in buses]
         imu = replace(imu, interface="sim", channel=f"{simulated_in}/imu.sock")
     return Robot(config, [open_bus(b, wires.get(b.name)) for b in buses], open_imu(imu, wires.get("imu")))
-
-
-def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton product of two quaternions (4,), w first."""
-    w, v, x, u = a[0], a[1:], b[0], b[1:]
-    return np.concatenate([[w * x - v @ u], w * u + x * v + np.cross(v, u)])
-
-
-def matrix_of(q: np.ndarray) -> np.ndarray:
-    """Rotation matrix (3, 3) of a unit quaternion (4,), w first."""
-    w, x, y, z = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -9,7 +9,8 @@ second as if something moved the object, and a dribbled ball is half-way up by t
 Axes are those of the IMU's world (z up, yaw arbitrary), the origin is on the floor: where the object is, the robot's feet
 tell (``limbs``), for a base that sways is no place from which a flight looks like one. Of a robot that does not know its
 feet the base counts as standing still. A sample is placed at the time it was taken, with the orientation and the base of
-that time; the answer is for now.
+that time; the answer is for now. What flies meets the floor and the robot: that its own hand has pushed the ball since the
+last sample the robot need not see.
 """
 
 from __future__ import annotations
@@ -17,18 +18,23 @@ from __future__ import annotations
 import itertools
 import math
 from collections import deque
+from copy import copy
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from sim2real.limbs import Limbs
+from sim2real.quaternion import matrix_of, rotate
+from sim2real.solids import Solids, stopped, touches
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 # A bounce: s for which the ball is pressed flat on the floor (as the simulated one is: drivers/sim/ball.py); by how much of
 # its speed it leaves faster or slower than it should; m/s that friction may add sideways.
 PRESSED, UNSURE, RUBS = 0.022, 0.1, 0.1
 PRESS = 0.02  # m, by which it is pressed
+STEP = 0.01  # s, at most, in which what flies is looked at where it may meet the robot
+FAST = 5.0  # m/s of a robot's hands, at most
 NOBODY = Limbs()
 
 
@@ -60,6 +66,16 @@ class Counters:
     early: int = 0  # taken in the future: the clocks disagree
     strange: int = 0  # too far from every hypothesis, or not finite
     restarts: int = 0
+
+
+class _Moment(NamedTuple):
+    """What the robot was like, in the world's axes."""
+
+    time: float  # s
+    orientation: np.ndarray  # (4,) of the base
+    base: np.ndarray  # (3,) m
+    palms: np.ndarray  # (k, 3) m
+    solids: Solids
 
 
 class _Hypothesis:
@@ -129,7 +145,7 @@ class ObjectTracker:
         # Drag and spin disturb a flight by less than 1 m/s^2, as a swaying robot does a ball it holds; hands that move a
         # ball do so with tens of m/s^2 for tenths of a second.
         self._hypotheses = [_Hypothesis(True, 0.01), _Hypothesis(False, 0.005), _Hypothesis(False, 30.0)]
-        self._turned: deque[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = deque()
+        self._moments: deque[_Moment] = deque()
         self._time = -math.inf  # of the newest sample used
         self._strange = 0
 
@@ -166,10 +182,11 @@ class ObjectTracker:
             e.position_in_base[:], e.velocity_in_base[:] = np.nan, np.nan
             return e
         base = np.array([0.0, 0.0, self.height]) if limbs.base is None else limbs.base
-        palms = np.array([base + rotate(orientation_base_in_world, palm) for palm in limbs.palms])
-        self._turned.append((now, np.array(orientation_base_in_world, float), base, palms))
-        while self._turned[0][0] < now - self.memory:
-            self._turned.popleft()
+        orientation, turn = np.array(orientation_base_in_world, float), matrix_of(orientation_base_in_world)
+        solids = limbs.solids.seen_from(base, turn)
+        self._moments.append(_Moment(now, orientation, base, base + limbs.palms @ turn.T, solids))
+        while self._moments[0].time < now - self.memory:
+            self._moments.popleft()
         if self._time == -math.inf:
             return e
         e.age = now - self._time
@@ -177,7 +194,7 @@ class ObjectTracker:
         back = orientation_base_in_world * [1.0, -1.0, -1.0, -1.0]
         position, velocity = np.zeros(3), np.zeros(3)
         for h in self._hypotheses:
-            p, v, _ = h.predicted(ahead, self.radius, self.restitution)
+            p, v, _ = self._predicted(h, ahead)
             position += h.weight * p
             velocity += h.weight * v
         e.position_in_base[:] = rotate(back, position - base)
@@ -187,24 +204,52 @@ class ObjectTracker:
 
     def _then(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Orientation and place of the base, and places of the palms at ``time``, between those remembered next to it."""
-        if not self._turned or time < self._turned[0][0]:
+        if not self._moments or time < self._moments[0].time:
             self.counters.stale += 1
             return None
-        newest = self._turned[-1]
-        if time >= newest[0]:
-            if time > newest[0] + 0.1:
-                self.counters.early += 1
-                return None
-            return newest[1:]
-        for (t1, q1, *places1), (t0, q0, *places0) in itertools.pairwise(reversed(self._turned)):
-            if t0 <= time:
-                share = (time - t0) / (t1 - t0)
-                mixed = (1 - share) * q0 + share * (q1 if q0 @ q1 >= 0 else -q1)
-                base, palms = (
-                    b + share * (a - b) if a.shape == b.shape else b for a, b in zip(places1, places0, strict=True)
-                )
-                return mixed / np.linalg.norm(mixed), base, palms
-        return self._turned[0][1:]
+        before, after = self._around(time)
+        if time > after.time + 0.1:
+            self.counters.early += 1
+            return None
+        if time >= after.time:
+            return after[1:4]
+        share = (time - before.time) / (after.time - before.time)
+        q1, q0 = after.orientation, before.orientation
+        mixed = (1 - share) * q0 + share * (q1 if q0 @ q1 >= 0 else -q1)
+        base, palms = (
+            b + share * (a - b) if a.shape == b.shape else b for a, b in zip(after[2:4], before[2:4], strict=True)
+        )
+        return mixed / np.linalg.norm(mixed), base, palms
+
+    def _around(self, time: float) -> tuple[_Moment, _Moment]:
+        """The newest moment that was over at ``time`` and the next; both the same if only one is known."""
+        pairs = itertools.pairwise(reversed(self._moments))
+        first = self._moments[0]
+        return next(((before, after) for after, before in pairs if before.time <= time), (first, first))
+
+    def _predicted(self, h: _Hypothesis, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As ``_Hypothesis.predicted``, ``dt`` s on from the newest sample that was used; the robot is in the way of what
+        flies."""
+        speed = math.sqrt(h.velocity @ h.velocity) + FAST - GRAVITY[2] * dt
+        solids = self._moments[-1].solids
+        if dt <= 0 or not (h.flies and solids.within(self.radius + speed * dt, h.position).any()):
+            return h.predicted(dt, self.radius, self.restitution)
+        steps = math.ceil(dt / STEP)
+        ahead, step = copy(h), dt / steps
+        for k in range(1, steps + 1):
+            ahead.position, ahead.velocity, ahead.covariance = state = ahead.predicted(
+                step, self.radius, self.restitution
+            )
+            time = self._time + k * step
+            before, after = self._around(time)
+            if len(before.solids.places) != len(after.solids.places):
+                before = after  # limbs were lost for a moment
+            lasts = after.time - before.time or math.inf
+            share = min((time - before.time) / lasts, 1.0)
+            for touch in touches(before.solids, after.solids, share, lasts, state[0], self.radius):
+                state = stopped(touch, *state, step)
+            ahead.position, ahead.velocity, ahead.covariance = state
+        return ahead.position, ahead.velocity, ahead.covariance
 
     def _restart(self, position: np.ndarray, time: float) -> None:
         for h in self._hypotheses:
@@ -219,7 +264,7 @@ class ObjectTracker:
         variance = np.full(3, self.noise**2)
         if position[2] < self.radius:  # it presses on the floor, and its centre comes closer than a bounce here knows
             variance[2] += PRESS**2
-        switched = self._switched(dt, palms)
+        switched = self._switched(dt, position, palms)
         ahead = []
         for k, h in enumerate(now):
             # Where a hypothesis comes from: itself, or another that switched to it (the mixing step).
@@ -227,7 +272,7 @@ class ObjectTracker:
             trial = _Hypothesis(h.flies, h.noise)
             trial.weight = float(shares.sum())
             trial.position, trial.velocity, trial.covariance = _mix(now, shares / trial.weight)
-            trial.position, trial.velocity, trial.covariance = trial.predicted(dt, self.radius, self.restitution)
+            trial.position, trial.velocity, trial.covariance = self._predicted(trial, dt)
             ahead.append(trial)
         distance = min(float(((position - t.position) ** 2 / (t.covariance[:, 0, 0] + variance)).sum()) for t in ahead)
         if distance > self.gate:
@@ -244,12 +289,12 @@ class ObjectTracker:
         self._hypotheses, self._time, self._strange = ahead, time, 0
         return True
 
-    def _switched(self, dt: float, palms: np.ndarray) -> np.ndarray:
-        """(k, k): chances that each hypothesis has become each other one within ``dt`` s."""
+    def _switched(self, dt: float, position: np.ndarray, palms: np.ndarray) -> np.ndarray:
+        """(k, k): chances that each hypothesis has become each other one within ``dt`` s, of an object that is seen at
+        ``position`` (3,) m."""
         count = len(self._hypotheses)
         rates = np.full((count, count), self.switching / (count - 1))
-        here, _, _ = self._hypotheses[0].predicted(dt, self.radius, self.restitution)
-        if len(palms) and np.linalg.norm(palms - here, axis=1).min() > self.reach:
+        if len(palms) and np.linalg.norm(palms - position, axis=1).min() > self.reach:
             rates[0] = self.alone / (count - 1)
         np.fill_diagonal(rates, 0.0)
         total = rates.sum(axis=1, keepdims=True)
@@ -275,11 +320,3 @@ def _time_to(floor: float, z: float, speed: float) -> float:
         return 0.0 if speed < 0 else math.inf
     g = -GRAVITY[2]
     return float(speed + math.sqrt(speed * speed + 2 * g * drop)) / g
-
-
-def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """A vector (3,) turned by a unit quaternion (4,). Written out: numpy's cross product spends 20 us on it."""
-    w, a, b, c = q.tolist()
-    x, y, z = v.tolist()
-    tx, ty, tz = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
-    return np.array([x + w * tx + b * tz - c * ty, y + w * ty + c * tx - a * tz, z + w * tz + a * ty - b * tx])

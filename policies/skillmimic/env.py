@@ -160,7 +160,7 @@ class Env(VecEnv):
         """Send the action's targets, late by each robot's delay, and let the physics run."""
         before = self.target.numpy()
         self._aim()
-        self.action = self.graph.clip(action)
+        self.action = self.graph.acted(self.measured, action)
         self.target = self.graph.target(self.measured, self.action)
         self.carries = self.graph.carries(self.measured, self.action)
         delay = np.floor(self.random.drawn["action_delay"][:, 0])
@@ -276,10 +276,11 @@ class Env(VecEnv):
     def _track(self) -> np.ndarray:
         """(envs, 6) object_position_in_base and object_velocity_in_base as a tracker tells them."""
         drawn = self.random.drawn
-        held = self.contacts.touching(self._recorded["sensordata"][:, -1])[:, 0] | (self._aims > 0)
+        touched = self.contacts.touching(self._recorded["sensordata"][:, -1])[:, 0]
         late, loss = drawn["object_delay"][:, 0].astype(int), drawn["object_loss"][:, 0]
         noise = np.repeat(np.hstack([drawn["object_noise"], drawn["object_velocity_noise"]]), 3, axis=1)
-        seen = self.sight.look(_ball(self._qpos, self._qvel), held, late, loss, noise, self.rng)
+        held = touched | (self._aims > 0)
+        seen = self.sight.look(_ball(self._qpos, self._qvel), held, touched, late, loss, noise, self.rng)
         return _in_base(seen, self._qpos, self._qvel) + np.pad(drawn["object_offset"], ((0, 0), (0, 3)))
 
     def _truth(self) -> np.ndarray:

@@ -117,8 +117,12 @@ class PolicyGraph(nn.Module):
     def clip(self, action: Tensor) -> Tensor:
         return torch.clamp(action, -self.config.action_max, self.config.action_max)
 
+    def acted(self, signals: Signals, action: Tensor) -> Tensor:
+        """What is done of an actor's ``action`` (N, acting): no more than may be, and nothing about a ball that is lost."""
+        return (1 - signals.lost.to(action.dtype)) * self.clip(action)
+
     def target(self, signals: Signals, action: Tensor) -> Tensor:
-        """Joint targets (N, n) rad for a clipped ``action`` (N, acting)."""
+        """Joint targets (N, n) rad for what is done of an ``action`` (N, acting)."""
         target = signals.rest + action @ self.drive
         return torch.minimum(torch.maximum(target, self.lower), self.upper)
 
@@ -198,6 +202,7 @@ class PolicyGraph(nn.Module):
             last = inputs["carry_skill"]
             skill = self.plan.performed(skill, last, inputs["carry_clock"], ball)
         posture, gravity, carried = skill @ self.postures, gravity_in_base(orientation), {}
+        lost = torch.zeros(len(skill), 1, dtype=torch.bool)
         if self.base is None:
             planned = torch.zeros(len(skill), 7)
             config = self.config
@@ -209,6 +214,7 @@ class PolicyGraph(nn.Module):
             rested = (inputs["carry_rested"] + 1) * Gait.resting(steps)
             calm = (rested >= RESTED) | (Gait.even(steps) & self.walking(command))
             plan = self.plan(skill, last, inputs["carry_clock"], inputs["carry_arms"], ball, calm)
+            lost = plan.lost
             planned = torch.cat([plan.ball_error, plan.clock / self.plan.longest], dim=-1)
             posture = plan.target @ self.spread
             # The base sees the arms on their way to where they were last sent.
@@ -223,13 +229,13 @@ class PolicyGraph(nn.Module):
             carried |= {_of_base(name): value for name, value in self.base.carries(seen, action).items()}
         return Signals(*joints, gravity, gyro, skill, inputs["object_position_in_base"],
                        inputs["object_velocity_in_base"], rest, planned, inputs["carry_action"],
-                       inputs["carry_history"], carried)  # fmt: skip
+                       inputs["carry_history"], lost, carried)  # fmt: skip
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """One tick of a batch of one: the tensors of ``inputs()``, in that order, to those of ``outputs()``."""
         signals = self.signals(**dict(zip(self.inputs(), inputs, strict=True)))
         observation = observe(signals)
-        action = self.clip(self.actor(observation))
+        action = self.acted(signals, self.actor(observation))
         return self.target(signals, action), *self.carries(signals, action).values(), observation, action + 0.0
 
 

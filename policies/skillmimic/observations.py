@@ -23,6 +23,7 @@ class Signals(NamedTuple):
     planned: Tensor  # (N, 7): m and m/s of the ball from where the plan has it, and the share of the plan that is over
     last_action: Tensor  # (N, actions)
     history: Tensor  # (N, ticks * size of PRESENT), newest first
+    lost: Tensor  # (N, 1) bool: a ball that comes up to no hand; arms stand still
     carried: dict[str, Tensor]  # what plan and base policy carry on, by name
 
 

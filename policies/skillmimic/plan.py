@@ -31,6 +31,8 @@ RESTED = 8.0
 SETTLE = 17.0  # rows for which they go on resting before legs bend
 LOST = 0.4  # m from its plan: a ball farther away does not come back
 SLOW = 0.5  # m/s: a ball slower than this says little about the time
+DEAD = 0.46  # m that a bounced ball comes up less high than planned: no stroke reaches it any more (terminations.DEAD)
+NEVER = -100.0  # m: no ball is that low
 # rad a tick: how fast targets go to where a skill begins. Arms that are thrown there throw the robot off its feet.
 APPROACH, AT_ONCE = 0.04, 10.0
 
@@ -79,6 +81,7 @@ class Planned(NamedTuple):
     pose: Tensor  # (N, n) rad from home, of the base
     clock: Tensor  # (N, 1) rows since the skill's beginning; negative while arms are on their way to it
     ball_error: Tensor  # (N, 6) m and m/s from where the plan has the ball
+    lost: Tensor  # (N, 1) bool: arms stand still until the ball is back
 
 
 class Plan(nn.Module):
@@ -96,6 +99,7 @@ class Plan(nn.Module):
     away: Tensor
     poses: Tensor
     bounce: Tensor
+    lowest: Tensor
     offsets: Tensor
     follow: Tensor
     reach: Tensor
@@ -120,6 +124,11 @@ class Plan(nn.Module):
         self.register_buffer("last", _buffer(lengths[:, None] - 1))
         jumps = [max(np.ptp(r.velocity[:, 2]) / GRAVITY, 0.1) if r.loop else 1.0 for r in rows]
         self.register_buffer("bounce", _buffer(np.array(jumps)[:, None]))
+        rises = [np.min(r.ball[:, 2] + r.velocity[:, 2] ** 2 / (2 * GRAVITY)) - DEAD for r in rows]
+        met = [[height if r.loop and r.left.any() else NEVER] for height, r in zip(rises, rows, strict=True)]
+        self.register_buffer(
+            "lowest", _buffer(met)
+        )  # m, of the peaks of a ball that is not lost to a palm that meets it
         self.register_buffer("loop", _buffer([[r.loop] for r in rows]))
         self.register_buffer("ready", _buffer([[r.ready] for r in rows]))
         self.register_buffer("settle", _buffer([[SETTLE * r.bends] for r in rows]))
@@ -158,7 +167,7 @@ class Plan(nn.Module):
         """
         same = (skill * last_skill).sum(dim=-1, keepdim=True)
         last, loop, ready = skill @ self.last, skill @ self.loop, skill @ self.ready
-        clock, rate = self._step(skill, same * last_clock, same, last, loop, ball, calm)
+        clock, rate, lost = self._step(skill, same * last_clock, same, last, loop, ball, calm)
         share = torch.clamp(clock, min=0.0) - torch.clamp(torch.floor(clock), min=0.0)
         row = self._row(skill, clock)
         following = self.following[row]
@@ -171,7 +180,7 @@ class Plan(nn.Module):
         moved = torch.cat([place, place[:, :2], speed, speed[:, :2]], dim=-1) * gains
         waits = (rate <= 0) & (same > 0) & (loop == 0)  # for a ball that is still somewhere else
         wanted = moved[:, : TIPS.stop] + moved[:, TIPS.stop :]
-        wanted = torch.where(waits, 0.0, torch.minimum(torch.maximum(wanted, -self.reach), self.reach))
+        wanted = torch.where(waits | lost, 0.0, torch.minimum(torch.maximum(wanted, -self.reach), self.reach))
         target = planned[:, : self.arms] + (mixed(self.knots)[:, :, None] * offsets).sum(dim=1)
         target = target + (self.back[row] * wanted[:, None]).sum(dim=-1)
         far = (target - last_target).abs().amax(dim=-1, keepdim=True)
@@ -179,7 +188,7 @@ class Plan(nn.Module):
         clock = torch.where((same == 0) & (ready > 0), begin, clock)  # a ball in the hands comes along
         step = torch.where((clock < 0) | ((clock < 1) & (ready == 0)), APPROACH, AT_ONCE)
         target = last_target + torch.minimum(torch.maximum(target - last_target, -step), step)
-        return Planned(target, mixed(self.poses), clock, error)
+        return Planned(target, mixed(self.poses), clock, error, lost)
 
     def _row(self, skill: Tensor, clock: Tensor) -> Tensor:
         """(N,) rows of the tables at a skill's ``clock`` (N, 1); its first before that has begun."""
@@ -187,8 +196,9 @@ class Plan(nn.Module):
 
     def _step(
         self, skill: Tensor, clock: Tensor, same: Tensor, last: Tensor, loop: Tensor, ball: Tensor, calm: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """The clock, moved on, and by how much: a row a tick, and faster or slower as the ball is ahead of its plan or behind.
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The clock, moved on, and by how much: a row a tick, and faster or slower as the ball is ahead of its plan or behind;
+        and whether the ball is lost.
 
         A ball that is caught is where the plan has it, sooner or later. One that bounces may never get that high; its
         velocity tells the time, and that jumps back by ``bounce`` s on the floor.
@@ -211,10 +221,14 @@ class Plan(nn.Module):
         # Somebody still holds the ball that is to bounce.
         still = (ball[:, 3:] * ball[:, 3:]).sum(-1, keepdim=True) < SLOW**2
         held = (loop > 0) & (clock >= 0) & (clock < 1) & still & (fast > (4 * SLOW) ** 2)
-        rate = torch.where(((lets_go | settles) & ~calm) | held, 0.0, rate)
+        rises = ball[:, 2:3] + ball[:, 5:6] ** 2 / (2 * GRAVITY)  # m, to where it will
+        beside = ((ball[:, :2] - planned[:, :2]) ** 2).sum(-1, keepdim=True) > LOST**2
+        lowest = skill @ self.lowest
+        lost = ((rises < lowest) | (beside & (lowest > NEVER))) & (clock >= 1)
+        rate = torch.where(((lets_go | settles) & ~calm) | held | lost, 0.0, rate)
         moved = clock + rate
         around = moved - (last + 1) * torch.clamp(torch.floor(moved / (last + 1)), min=0.0)
-        return torch.where(loop > 0, around, torch.minimum(moved, last)), rate
+        return torch.where(loop > 0, around, torch.minimum(moved, last)), rate, lost
 
 
 def document(file: str | Path | None) -> dict[str, dict]:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from sim2real.object.packet import Receiver, encode
-from sim2real.tracker import ObjectSample, rotate
+from sim2real.quaternion import rotate
+from sim2real.tracker import ObjectSample
 
 if TYPE_CHECKING:
     from drivers.sim.world import World

@@ -26,7 +26,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim2real.tracker import ObjectSample, rotate
+from sim2real.quaternion import rotate
+from sim2real.tracker import ObjectSample
 from sim2real.types import Sim2realError
 
 LAYOUT = struct.Struct("<4sHHIQ3f3f4f")

@@ -17,8 +17,9 @@ import numpy as np
 from drivers.sim.truth import Truth
 from sim2real.contract import Contract, Object, ObjectStart
 from sim2real.limbs import Limbs
+from sim2real.quaternion import rotate
 from sim2real.skills import Stage
-from sim2real.tracker import NOBODY, ObjectEstimate, ObjectTracker, rotate
+from sim2real.tracker import NOBODY, ObjectEstimate, ObjectTracker
 
 GRAVITY = 9.81  # m/s^2
 AWAY = 0.4  # m in front of its place: where a ball waits that will be put into the robot's hands

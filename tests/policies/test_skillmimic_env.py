@@ -15,7 +15,7 @@ from policies.skillmimic.env import BALL, JOINTS, Env
 from policies.skillmimic.evaluate import episodes_of, evaluate, measure
 from policies.skillmimic.graph import PolicyGraph
 from policies.skillmimic.randomisation import LOSS_TICKS, TABLE
-from policies.skillmimic.sight import LASTS, Sight, foretold
+from policies.skillmimic.sight import FINDS, KNOWN, LASTS, RUBS, Sight, foretold
 from policies.skillmimic.starts import thrown
 from policies.skillmimic.terminations import TERMINATIONS
 from sim2real.contract import CARRY, INPUTS
@@ -221,21 +221,22 @@ def test_where_in_the_world_it_is_and_how_fast_the_actor_cannot_tell(env):
         for part in (slice(0, 3), BALL if field == "qpos" else slice(-6, -3)):
             env._recorded[field][..., part] += moved
             (env._qpos if field == "qpos" else env._qvel)[:, part] += moved
-    since = CONFIG.period * np.arange(1, 1 + len(sight._past))[:, None, None]  # it has been going faster for a while
-    sight._past[..., :3] += 3.0 - 0.7 * since
-    sight._past[..., 3:] += 0.7
+    ages = np.arange(len(sight._past))[:, None]
+    for known, age in ((sight._past, ages), (sight._sighting, sight._age), (sight._found, sight._age)):
+        known[..., :3] += 3.0 - 0.7 * CONFIG.period * (1 + age[..., None])  # it has been going faster for a while
+        known[..., 3:] += 0.7
     env._observe()
     np.testing.assert_allclose(env.observation, before, atol=1e-5)
     assert (env.privileged - truth).abs().max() > 0.5
 
 
-def look(sight, truth, held=False, late=0, loss=0.0, noise=0.0, seed=0):
+def look(sight, truth, held=False, touched=False, late=0, loss=0.0, noise=0.0, seed=0):
     """One tick of a ``sight`` whose robots are all alike."""
     n = len(sight.lost)
     alike = lambda x: np.full(n, x)  # noqa: E731
     spread = np.full((n, 6), noise)
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(seed)
-    return sight.look(np.tile(truth, (n, 1)), alike(held), alike(late), alike(loss), spread, rng)
+    return sight.look(np.tile(truth, (n, 1)), alike(held), alike(touched), alike(late), alike(loss), spread, rng)
 
 
 def dropped(t, floor=ball.RADIUS):
@@ -257,14 +258,28 @@ def test_a_flight_is_known_for_now_however_late_it_is_seen(late):
         np.testing.assert_allclose(told, np.tile(dropped(k * dt), (2, 1)), atol=1e-9)
 
 
-def test_a_push_is_known_when_it_is_seen_and_in_a_hand_nothing_falls():
-    sight, still, pushed = Sight(1, CONFIG.period), np.array([0.3, 0, 0, 0, 0, 0.0]), np.array([0.3, 0, 0.1, 0, 0, 2.0])
+@pytest.mark.parametrize("own", [False, True])
+def test_a_push_is_known_when_it_is_seen_and_most_of_the_robots_own_at_once(own, monkeypatch):
+    """In a hand nothing falls; then it goes up at 2 m/s."""
+    monkeypatch.setattr("policies.skillmimic.sight.RUBS", 0.0)
+    sight, still = Sight(1, CONFIG.period), np.array([0.3, 0, 0, 0, 0, 0.0])
     sight.begin(np.arange(1), still[None], np.array([True]))
     for _ in range(5):
-        np.testing.assert_array_equal(look(sight, still, held=True, late=3)[0], still)
-    for _ in range(3):
-        np.testing.assert_array_equal(look(sight, pushed, held=True, late=3)[0], still)
-    np.testing.assert_allclose(look(sight, pushed, held=True, late=3)[0], pushed + [0, 0, 6 * CONFIG.period, 0, 0, 0])
+        np.testing.assert_array_equal(look(sight, still, held=True, touched=own, late=3)[0], still)
+    speeds = []
+    for k in range(12):
+        now = still + [0, 0, 2 * k * CONFIG.period, 0, 0, 2.0]
+        speeds.append(look(sight, now, held=True, touched=own, late=3)[0, 5])
+    known, finds = KNOWN if own else 0.0, FINDS[5]
+    expected = [2 - 2 * (1 - known) * (1 - finds) ** max(0, k - 2) for k in range(12)]
+    np.testing.assert_allclose(speeds, expected)
+
+
+def test_what_the_robot_touches_goes_a_little_otherwise_than_it_knows():
+    sight, still = Sight(4000, CONFIG.period), np.zeros(6)
+    sight.begin(np.arange(4000), np.zeros((4000, 6)), np.ones(4000, bool))
+    told = look(sight, still, held=True, touched=True)
+    assert told[:, 3:].std(axis=0) == pytest.approx(RUBS * (1 - FINDS[3:]), rel=0.05)
 
 
 def test_out_of_sight_a_ball_is_foretold_from_where_it_was_seen_last():
@@ -274,7 +289,7 @@ def test_out_of_sight_a_ball_is_foretold_from_where_it_was_seen_last():
         sight.lost[:] = k > 0
         told = look(sight, dropped(k * dt) if k == 0 else np.full(6, 9.0), late=0)
         np.testing.assert_allclose(told[0], dropped(k * dt), atol=1e-9)
-    assert (look(sight, np.full(6, 9.0), held=True) == 9.0).all()  # there it is again
+    assert (look(sight, np.full(6, 9.0), held=True)[0, :3] > 8.0).all()  # there it is again
     sight.begin(np.arange(1), dropped(0.0)[None], np.array([False]))
     assert look(sight, np.full(6, 9.0), loss=1.0)[0, 0] < 1.0 and 0 <= sight.lost[0] < LOSS_TICKS[1]
 
@@ -296,7 +311,7 @@ def test_what_a_tracker_is_off_by_lasts_a_few_ticks():
 
 
 def test_a_ball_lost_from_the_first_tick_is_not_where_the_last_episodes_was(env):
-    env.sight._sighting[:] = 9.0
+    env.sight._sighting[:] = env.sight._found[:] = 9.0
     env._start(np.arange(env.num_envs))
     env.sight.lost[:] = 3
     env._observe()

@@ -18,7 +18,21 @@ from policies.skillmimic.config import TASKS
 from policies.skillmimic.env import Env
 from policies.skillmimic.graph import PULL, PolicyGraph
 from policies.skillmimic.optimise import Search, optimise, score, write
-from policies.skillmimic.plan import APPROACH, KNOTS, REACH, RESTED, SETTLE, TIPS, Correction, Plan, Rows, read, samples
+from policies.skillmimic.plan import (
+    APPROACH,
+    DEAD,
+    KNOTS,
+    LOST,
+    REACH,
+    RESTED,
+    SETTLE,
+    TIPS,
+    Correction,
+    Plan,
+    Rows,
+    read,
+    samples,
+)
 from sim2real.types import Sim2realError
 
 ARMS, T = 2, 8
@@ -227,6 +241,25 @@ def test_palms_do_not_follow_a_ball_that_the_plan_still_waits_for():
     np.testing.assert_allclose(p.target, [[0.3, 0.0]], atol=1e-6)
 
 
+@pytest.mark.parametrize(("ball", "lost"), [
+    (where(3), False),
+    ([0.06, 0.0, -DEAD - 0.01, 1.0, 0.0, 0.0], True),  # it comes up to no hand
+    ([0.06, 0.0, -DEAD - 0.01, 1.0, 0.0, 1.0], False),  # but for its speed
+    ([0.06, LOST + 0.01, 0.0, 1.0, 0.0, 0.0], True),
+    ([0.06, LOST - 0.01, 0.0, 1.0, 0.0, 0.0], False),
+])  # fmt: skip
+def test_arms_stand_still_while_a_ball_that_a_palm_is_to_meet_is_lost(ball, lost):
+    met = rows(loop=True)
+    met.left[2] = 0.1
+    plan = Plan([met], [correction(follow=[0.0, 0.0, 0.5, 0.0, 0.0])])
+    p = at(plan, 3.0, ball, target=0.3)
+    assert bool(p.lost) == lost and float(p.clock) == (3.0 if lost else 4.0)
+    if lost:
+        np.testing.assert_allclose(p.target, [[0.3, 0.0]], atol=1e-6)
+    assert not at(plan, 0.5, ball).lost  # nobody has brought it yet
+    assert not at(Plan([rows(loop=True)], [correction()]), 3.0, ball).lost  # which two palms catch, or nobody meets
+
+
 def test_what_was_found_is_read_back(tmp_path):
     path = tmp_path / "plan.yaml"
     some = Correction(
@@ -419,6 +452,24 @@ def test_a_palm_that_meets_a_ball_stays_level_and_is_told_how_long_that_rises():
     np.testing.assert_allclose(left, np.maximum(rises, 0) / 9.81 * (left > 0), atol=1e-6)
     assert 0.4 < left[0] < 0.46 and (left[rises < 0] == 0).all()
     assert not graphs[()].plan.table[:, -1].any()
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_nothing_is_done_about_a_ball_that_is_lost(lost):
+    """Nor are the file's targets others, or the next tick told of anything."""
+    env = Env(dataclasses.replace(TASKS["g1-dribble"], envs=2, threads=1), 0)
+    graph, carries = env.graph, {**env.carries, "carry_clock": torch.full((2, 1), 5.0)}
+    env.inputs["object_position_in_base"] += torch.tensor([0.0, 2.0 * lost, 0.0])
+    env.measured = graph.signals(**env.inputs, **carries)
+    env._act(torch.full((2, env.num_actions), 99.0))
+    assert (env.action == (0.0 if lost else env.config.action_max)).all()
+    assert (env.carries["carry_action"] == env.action).all()
+    graph.actor = torch.nn.Linear(graph.outputs()["observation"][0], env.num_actions)
+    torch.nn.init.zeros_(graph.actor.weight)
+    torch.nn.init.constant_(graph.actor.bias, 99.0)
+    target, carried, *_ = graph(*(t[:1] for t in {**env.inputs, **carries}.values()))
+    assert (carried == env.action[:1]).all()
+    torch.testing.assert_close(target.detach(), env.target[:1], atol=1e-5, rtol=0.0)
 
 
 def test_a_base_that_is_to_stand_steps_later():

@@ -10,8 +10,9 @@ from drivers.open import open_world
 from drivers.sim.world import World
 from sim2real.clock import SimClock
 from sim2real.config import load_robot
+from sim2real.quaternion import matrix_of, multiply
 from sim2real.records import command_view, state_view, tick_layout
-from sim2real.robot import matrix_of, multiply, open_robot
+from sim2real.robot import open_robot
 
 
 @pytest.fixture

@@ -10,7 +10,8 @@ from sim2real.config import load_robot
 from sim2real.contract import Object
 from sim2real.object.camera import SimCamera
 from sim2real.object.scene import prepare_for
-from sim2real.tracker import ObjectTracker, rotate
+from sim2real.quaternion import rotate
+from sim2real.tracker import ObjectTracker
 
 
 def test_a_dropped_ball_is_followed_through_its_bounces():
