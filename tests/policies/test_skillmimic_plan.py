@@ -458,11 +458,12 @@ def test_a_palm_that_meets_a_ball_stays_level_and_is_told_how_long_that_rises():
 def test_nothing_is_done_about_a_ball_that_is_lost(lost):
     """Nor are the file's targets others, or the next tick told of anything."""
     env = Env(dataclasses.replace(TASKS["g1-dribble"], envs=2, threads=1), 0)
-    graph, carries = env.graph, {**env.carries, "carry_clock": torch.full((2, 1), 5.0)}
+    graph, carries = env.graph, {**env.carries, "carry_clock": env.carries["carry_clock"].clamp(min=1.0)}
     env.inputs["object_position_in_base"] += torch.tensor([0.0, 2.0 * lost, 0.0])
     env.measured = graph.signals(**env.inputs, **carries)
     env._act(torch.full((2, env.num_actions), 99.0))
-    assert (env.action == (0.0 if lost else env.config.action_max)).all()
+    assert env.measured.lost.all() if lost else not env.measured.lost.all()
+    assert (env.action == torch.where(env.measured.lost, 0.0, env.config.action_max)).all()
     assert (env.carries["carry_action"] == env.action).all()
     graph.actor = torch.nn.Linear(graph.outputs()["observation"][0], env.num_actions)
     torch.nn.init.zeros_(graph.actor.weight)
