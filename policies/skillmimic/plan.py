@@ -126,9 +126,7 @@ class Plan(nn.Module):
         self.register_buffer("bounce", _buffer(np.array(jumps)[:, None]))
         rises = [np.min(r.ball[:, 2] + r.velocity[:, 2] ** 2 / (2 * GRAVITY)) - DEAD for r in rows]
         met = [[height if r.loop and r.left.any() else NEVER] for height, r in zip(rises, rows, strict=True)]
-        self.register_buffer(
-            "lowest", _buffer(met)
-        )  # m, of the peaks of a ball that is not lost to a palm that meets it
+        self.register_buffer("lowest", _buffer(met))  # m that a ball comes up which is not lost to a palm that meets it
         self.register_buffer("loop", _buffer([[r.loop] for r in rows]))
         self.register_buffer("ready", _buffer([[r.ready] for r in rows]))
         self.register_buffer("settle", _buffer([[SETTLE * r.bends] for r in rows]))

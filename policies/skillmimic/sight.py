@@ -16,8 +16,8 @@ from sim2real.tracker import PRESSED
 
 LASTS = 0.6  # of a filter's error, what is left of it a tick later
 NEVER = 10**6  # ticks
-# Of what the robot does to a ball, the share that its tracker foretells, and by how much it is wrong, m/s a tick.
-KNOWN, RUBS = 0.75, 0.2
+# Of what the robot does to a ball, the share that its tracker foretells, and that of its speed by which it is wrong each way.
+KNOWN, WRONG = 0.75, 0.8
 # Of what a filter is off by, in place and speed, what a sighting puts right: fits tracker and camera under a dribbled ball.
 FINDS = np.array([0.9, 0.9, 0.9, 0.35, 0.35, 0.6])
 
@@ -75,7 +75,8 @@ class Sight:
         known = KNOWN * (self._alone <= self._age + 1)[:, None]
         surprise = newest - foretold(self._sighting, between, ~self._in_hand)
         found = foretold(self._found, between, ~self._in_hand) + known * surprise
-        found[:, 3:] += RUBS * touched[:, None] * rng.standard_normal((len(found), 3))
+        pushed = np.linalg.norm(surprise[:, 3:], axis=1) * touched
+        found[:, 3:] += WRONG * pushed[:, None] * rng.standard_normal((len(found), 3))
         self._found = np.where(sees[:, None], found + FINDS * (newest - found), self._found)
         self._sighting = np.where(sees[:, None], newest, self._sighting)
         self._in_hand = np.where(sees, in_hand, self._in_hand)
