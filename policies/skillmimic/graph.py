@@ -202,9 +202,8 @@ class PolicyGraph(nn.Module):
             last = inputs["carry_skill"]
             skill = self.plan.performed(skill, last, inputs["carry_clock"], ball)
         posture, gravity, carried = skill @ self.postures, gravity_in_base(orientation), {}
-        lost = torch.zeros(len(skill), 1, dtype=torch.bool)
         if self.base is None:
-            planned = torch.zeros(len(skill), 7)
+            planned, lost = torch.zeros(len(skill), 7), torch.zeros(len(skill), 1, dtype=torch.bool)
             config = self.config
             ankle = config.balance_gain * (gravity[:, 0:1] - skill @ self.lean) + config.balance_damping * gyro[:, 1:2]
             rest = posture + self.ankles * ankle
@@ -214,8 +213,7 @@ class PolicyGraph(nn.Module):
             rested = (inputs["carry_rested"] + 1) * Gait.resting(steps)
             calm = (rested >= RESTED) | (Gait.even(steps) & self.walking(command))
             plan = self.plan(skill, last, inputs["carry_clock"], inputs["carry_arms"], ball, calm)
-            lost = plan.lost
-            planned = torch.cat([plan.ball_error, plan.clock / self.plan.longest], dim=-1)
+            planned, lost = torch.cat([plan.ball_error, plan.clock / self.plan.longest], dim=-1), plan.lost
             posture = plan.target @ self.spread
             # The base sees the arms on their way to where they were last sent.
             hands = self.acts * (posture - self.base.home + inputs["carry_action"] @ self.drive)
